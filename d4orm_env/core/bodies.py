@@ -5,7 +5,7 @@ Gaps, between footprints and from them to a world, are in float64: for checks of
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import combinations, product
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -18,6 +18,7 @@ from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.footprints import MAX_CORNERS, Core, Disc, Ellipsoid, Footprint, Planar, Polygon, Train
 
 if TYPE_CHECKING:
+    from d4orm_env.core.problem import Problem
     from d4orm_env.core.team import Team
     from d4orm_env.core.world import World
 
@@ -44,14 +45,6 @@ def find_bodies(footprints: Sequence[Footprint], models: Sequence[Model], hitche
         for footprint, (component, _) in zip(others, model.trailers, strict=True):
             trailers.append(Body(robot, footprint, component, next(lengths)))
     return (*robots, *trailers)
-
-
-def numbers_by_robot(bodies: Sequence[Body], num_robots: int, some: Iterable[int] | None = None) -> list[list[int]]:
-    """Each robot's bodies, all or ``some``, by their numbers, the robot itself first."""
-    numbers: list[list[int]] = [[] for _ in range(num_robots)]
-    for i in range(len(bodies)) if some is None else some:
-        numbers[bodies[i].robot].append(i)
-    return numbers
 
 
 def body_poses(bodies: Sequence[Body], states: FloatArray, d: int) -> Floats:
@@ -150,23 +143,54 @@ def pair_gap(one: Footprint, pose: Floats, other: Footprint, its_pose: Floats) -
     return _core_gap(_placed(one, pose), _placed(other, its_pose))
 
 
-def least_gap(bodies: Sequence[Body], poses: Floats, some: Sequence[int], others: Sequence[int]) -> float:
-    """Least signed gap between bodies of these numbers, at poses ``(F, d + 1)`` [m]."""
-    pairs = product(some, others)
-    return min(pair_gap(bodies[i].footprint, poses[i], bodies[j].footprint, poses[j]) for i, j in pairs)
+def gaps_at(team: Team, poses: Floats, world: World) -> Callable[[int, int], float]:
+    """``gap(one, other)``, the signed gap of two robots, or of one and itself that to the world [m].
+
+    Poses are ``(F, d + 1)``, or without the trailers ``(K, d + 1)``; bodies that are nowhere, NaN, do not count.
+    """
+    shapes = [body.footprint for body in team.bodies]
+    numbers: list[list[int]] = [[] for _ in range(team.num_robots)]
+    for i in np.flatnonzero(~np.isnan(poses[:, : team.dimension]).any(axis=1)).tolist():
+        numbers[team.bodies[i].robot].append(i)
+
+    def gap(one: int, other: int) -> float:
+        if one == other:
+            return min(world_gap(world, shapes[i], poses[i]) for i in numbers[one])
+        pairs = product(numbers[one], numbers[other])
+        return min(pair_gap(shapes[i], poses[i], shapes[j], poses[j]) for i, j in pairs)
+
+    return gap
 
 
-def touching(team: Team, states: FloatArray, among: NDArray[np.intp], rounding: float) -> dict[int, list[int]]:
+def nearest(problem: Problem, states: FloatArray, enough: float = np.inf) -> float:
+    """The least signed gap in states ``(K, n)``, between two robots or to the world [m]; infinite beyond ``enough``.
+
+    A robot that may face anywhere, NaN, counts with its inner disc.
+    """
+    team, world, d, least = problem.team, problem.world, problem.dimension, np.inf
+    points, radius = states[:, :d].astype(np.float64), team.radius.astype(np.float64)
+    outer = np.linalg.norm(points[:, None] - points, axis=2) - radius[:, None] - radius
+    outer[np.tril_indices(len(outer), -1)] = np.inf
+    outer[np.diag_indices_from(outer)] = world.clearance(states[:, :d]) - radius
+    gap = gaps_at(team, team.body_poses(states), world)
+    for number in np.argsort(outer, axis=None, kind="stable").tolist():
+        if outer.flat[number] >= min(least, enough):
+            break
+        least = min(least, gap(*divmod(number, len(outer))))
+    return least
+
+
+def touching(problem: Problem, states: FloatArray, among: NDArray[np.intp], rounding: float) -> dict[int, list[int]]:
     """Partners in contact of each robot, of those ``among`` ``(C,)``, in states ``(K, n)``, by number.
 
     Gaps of no more than ``rounding`` count as none [m].
     """
-    d, poses, bodies = team.dimension, team.body_poses(states), team.bodies
-    numbers = numbers_by_robot(bodies, team.num_robots)
+    team, d, poses = problem.team, problem.dimension, problem.team.body_poses(states)
+    gap = gaps_at(team, poses, problem.world)
     partners: dict[int, list[int]] = {}
     for one, other in combinations(among.tolist(), 2):
         apart = np.linalg.norm(poses[one, :d] - poses[other, :d]) - team.radius[one] - team.radius[other]
-        if apart <= rounding and least_gap(bodies, poses, numbers[one], numbers[other]) <= rounding:
+        if apart <= rounding and gap(one, other) <= rounding:
             partners.setdefault(one, []).append(other)
             partners.setdefault(other, []).append(one)
     return partners

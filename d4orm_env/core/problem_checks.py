@@ -18,7 +18,7 @@ from d4orm_env.core.arrays import (
     short_repr,
     whole_number,
 )
-from d4orm_env.core.bodies import body_poses, least_gap, near_pairs, numbers_by_robot, world_gap
+from d4orm_env.core.bodies import body_poses, gaps_at, near_pairs, world_gap
 from d4orm_env.core.goal_poses import states_at_goals
 from d4orm_env.core.team import Team
 from d4orm_env.core.winding import MAX_ANGLE, MOST_TURNS
@@ -206,18 +206,15 @@ def check_positions(
     gaps = world.clearance(positions) - radius
     if poses is None:
         poses = np.column_stack([positions.astype(np.float64), np.full(len(positions), np.nan)])
-    placed = np.flatnonzero(~np.isnan(poses[:, 0])) if shaped else ()
-    bodies = numbers_by_robot(team.bodies, team.num_robots, placed)
+    gap_of = gaps_at(team, poses, world)
     for robot in np.flatnonzero(gaps <= margin) if shaped else ():
-        gaps[robot] = min(world_gap(world, team.bodies[i].footprint, poses[i]) for i in bodies[robot])
+        gaps[robot] = gap_of(int(robot), int(robot))
     for robot in np.flatnonzero(gaps <= 0):
         where = f"{what} of robot_{robot} at {_point(positions[robot])} is {0 - gaps[robot]:.3g} m inside an obstacle"
         raise ValueError(f"{where} or outside the bounds ({_size(team, int(robot))}); move it, or change the world")
     first, second, between = near_pairs(positions.astype(np.float64), radius, margin)
     if shaped:
-        pairs = zip(first.tolist(), second.tolist(), strict=True)
-        gaps_of_pairs = [least_gap(team.bodies, poses, bodies[one], bodies[other]) for one, other in pairs]
-        between = np.array(gaps_of_pairs, np.float64)
+        between = np.array([gap_of(one, other) for one, other in zip(first.tolist(), second.tolist(), strict=True)])
     if len(overlapping := np.flatnonzero(between <= 0)):
         of_first = overlapping[second[overlapping] == second[overlapping].min()]
         pair = int(of_first[np.argmin(between[of_first])])

@@ -138,7 +138,7 @@ class TeamSimulation(Simulation):
         flags = worlds.collided[0].copy(), worlds.violated[0].copy()
         terms = {name: values[0] for name, values in self.terms.items()}
         problem, collided = self.problem, np.flatnonzero(flags[0])
-        partners = touching(problem.team, self.states, collided, problem.rounding) if len(collided) > 1 else {}
+        partners = touching(problem, self.states, collided, problem.rounding) if len(collided) > 1 else {}
         self.last = TeamStep(
             self.show(observations)[0], rewards, arrived, *flags, worlds.distance[0].copy(), partners, terms
         )

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
-from d4orm_env.core.bodies import pair_gap, world_gap
+from d4orm_env.core.bodies import nearest, world_gap
 from d4orm_env.core.goal_poses import states_at_goals
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -119,7 +119,7 @@ def distance_kept(problem: Problem, bent: BoolArray) -> float:
     for robot, model in enumerate(team.robot_models):
         if bent[robot]:
             goals[robot, model.heading_index] = np.nan
-    return min(usual, 0.9 * min(_room(problem, problem.start, usual), _room(problem, goals, usual)))
+    return min(usual, 0.9 * min(nearest(problem, problem.start, usual), nearest(problem, goals, usual)))
 
 
 def _at_goals(problem: Problem) -> FloatArray:
@@ -139,27 +139,6 @@ def must_bend(problem: Problem) -> BoolArray:
         if team.robot_models[body.robot].trailers and free and not np.isnan(pose).any():
             bent[body.robot] |= world_gap(problem.world, body.footprint, pose) <= 0
     return bent
-
-
-def _room(problem: Problem, states: FloatArray, enough: float) -> float:
-    """The least gap between robots, and to the world, in states ``(K, n)``; only those below ``enough`` are looked at.
-
-    A robot that may face anywhere counts with its inner disc, and its trailers do not.
-    """
-    team, world, room = problem.team, problem.world, np.inf
-    poses, radius = team.body_poses(states), team.radius.astype(np.float64)
-    bodies: list[list[int]] = [[] for _ in range(team.num_robots)]
-    for i, body in enumerate(team.bodies):
-        if not np.isnan(poses[i, :2]).any():
-            bodies[body.robot].append(i)
-    shapes = [body.footprint for body in team.bodies]
-    for robot in np.flatnonzero(world.clearance(states[:, :2]) - radius < enough):
-        room = min([room, *(world_gap(world, shapes[i], poses[i]) for i in bodies[robot])])
-    apart = np.linalg.norm(states[:, None, :2].astype(np.float64) - states[None, :, :2], axis=2)
-    for one, other in np.argwhere(np.triu(apart - radius[:, None] - radius < enough, 1)).tolist():
-        gaps = (pair_gap(shapes[i], poses[i], shapes[j], poses[j]) for i in bodies[one] for j in bodies[other])
-        room = min([room, *gaps])
-    return room
 
 
 @dataclass(frozen=True, eq=False)

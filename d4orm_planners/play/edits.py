@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.bodies import gaps_at
+from d4orm_env.core.goal_poses import states_at_goals
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_resolution
 from d4orm_env.envs.lifelong import goal_region
@@ -32,8 +34,7 @@ def move_goal(problem: Problem, robot: int, position: ArrayLike) -> Problem:
     check_robot(problem, robot)
     goal = np.array(problem.goal)
     goal[robot] = position
-    _check_position(problem, "the goal", robot, goal)
-    return problem.with_state(problem.start, goal)
+    return _checked(problem.with_state(problem.start, goal), "the goal", robot)
 
 
 def move_robot(problem: Problem, robot: int, position: ArrayLike) -> Problem:
@@ -42,8 +43,7 @@ def move_robot(problem: Problem, robot: int, position: ArrayLike) -> Problem:
     start = np.array(problem.start)
     start[robot, : problem.dimension] = position
     _stop(problem, start, robot)
-    _check_position(problem, "the robot", robot, start[:, : problem.dimension])
-    return problem.with_state(start, problem.goal)
+    return _checked(problem.with_state(start, problem.goal), "the robot", robot)
 
 
 def check_robot(problem: Problem, robot: int) -> None:
@@ -137,9 +137,9 @@ def followed(before: Problem, after: Problem, other: Problem, who: str) -> Probl
         moved.append([*np.flatnonzero(~same), *range(kept, len(new))])
     changed = after.with_state(*positions)
     try:
-        for what, rows, robots in zip(("the robot", "the goal"), positions, moved):
+        for what, robots in zip(("the robot", "the goal"), moved):
             for robot in robots:
-                _check_position(changed, what, int(robot), rows[:, : changed.dimension])
+                _checked(changed, what, int(robot))
         if after.world is not before.world:
             _check_world(changed)
     except ValueError as error:
@@ -160,27 +160,28 @@ def _with_world(problem: Problem, **changes: object) -> Problem:
 
 def _check_world(problem: Problem) -> None:
     """Refuse obstacles on robots and goals."""
-    radius = np.asarray(problem.team.radius, np.float64)
-    for what, positions in (("robot", problem.start[:, : problem.dimension]), ("goal of robot", problem.goal)):
-        touched = np.flatnonzero(problem.world.clearance(positions) <= radius)
-        if len(touched):
-            raise ValueError(f"the obstacle would touch the {what}_{touched[0]}; put it elsewhere")
+    team, world, d = problem.team, problem.world, problem.dimension
+    for what, states in (("robot", problem.start), ("goal of robot", states_at_goals(problem))):
+        gap = gaps_at(team, team.body_poses(states), world)
+        for robot in np.flatnonzero(world.clearance(states[:, :d]) <= team.radius).tolist():
+            if gap(robot, robot) <= 0:
+                raise ValueError(f"the obstacle would touch the {what}_{robot}; put it elsewhere")
 
 
-def _check_position(problem: Problem, what: str, robot: int, positions: FloatArray) -> None:
-    """Refuse the position of a robot, a row of ``positions`` ``(K, d)``, if it is not finite or touches something."""
-    radius = np.asarray(problem.team.radius, np.float64)
-    if not np.isfinite(positions[robot]).all():
-        raise ValueError(f"{what} of robot_{robot} is at no position; drag it again")
-    check_resolution(problem.team, positions, problem.dt, problem.goal_radius)
-    if problem.world.clearance(positions[robot]) <= radius[robot]:
+def _checked(problem: Problem, what: str, robot: int) -> Problem:
+    """The problem, refused if ``"the robot"``, or ``"the goal"``, of a robot touches something."""
+    states = problem.start if what == "the robot" else states_at_goals(problem)
+    team, positions = problem.team, states[:, : problem.dimension]
+    check_resolution(team, positions, problem.dt, problem.goal_radius)
+    gap = gaps_at(team, team.body_poses(states), problem.world)
+    if problem.world.clearance(positions[robot]) <= team.radius[robot] and gap(robot, robot) <= 0:
         raise ValueError(f"{what} of robot_{robot} would touch an obstacle or the bounds; it stays where it was")
-    gaps = np.linalg.norm(positions - positions[robot], axis=1) - radius - radius[robot]
-    gaps[robot] = np.inf
-    if gaps.min() <= 0:
-        raise ValueError(
-            f"{what} of robot_{robot} would touch that of robot_{int(gaps.argmin())}; it stays where it was"
-        )
+    outer = np.linalg.norm(positions - positions[robot], axis=1) - team.radius - team.radius[robot]
+    outer[robot] = np.inf
+    for other in np.flatnonzero(outer <= 0).tolist():
+        if gap(robot, other) <= 0:
+            raise ValueError(f"{what} of robot_{robot} would touch that of robot_{other}; it stays where it was")
+    return problem
 
 
 def _free_position(

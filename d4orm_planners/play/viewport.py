@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.bodies import nearest
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
@@ -248,7 +249,7 @@ class Viewport:
             collided=np.array(self._env.last_step.collided),
             loop=self._loop,
             replanned=self._replanned,
-            closest=closest_approach(self._scene, joint.states),
+            closest=nearest(self._scene, joint.states),
             plan=_plan(self._policy, joint.steps),
             guidance=_guidance(self._policy),
             subgoals=getattr(self._policy, "subgoals", None),
@@ -269,16 +270,6 @@ class Viewport:
     def _remember(self) -> None:
         joint, last = self._joint, self._env.last_step
         self.recording.add(joint.states, joint.goals, joint.arrived, last.collided, last.margin_violated, self._bodies)
-
-
-def closest_approach(problem: Problem, states: FloatArray) -> float:
-    """Least distance between the surfaces of two robots, or of one and an obstacle or the bounds [m]."""
-    positions = states[:, : problem.dimension].astype(np.float64)
-    radius = np.asarray(problem.team.radius, np.float64)
-    least = float((problem.world.clearance(positions) - radius).min())
-    gaps = np.linalg.norm(positions[:, None] - positions, axis=2) - radius[:, None] - radius
-    gaps[np.diag_indices(len(positions))] = np.inf
-    return min(least, float(gaps.min()))
 
 
 def _plan(policy: object, steps: int) -> FloatArray | None:

@@ -292,7 +292,10 @@ BAD_FILES = [
     (MINIMAL.replace(f"[{ROBOT}]", f"[{ROBOT}, {ROBOT}]"), "starts of robot_0 .* overlap"),
     (MINIMAL + "world: {spheres: [{center: [0, 5, 0], radius: 1}]}", "spheres need a world of dimension 3"),
     (MINIMAL + "world: {circles: [{center: [0, 0], radius: 1}]}", "start of robot_0 .* inside an obstacle"),
-    (MINIMAL + "world: {boxes: [{lower: [0, 5], upper: [1]}]}", r"world.boxes\[0\].upper: \[1\] has 1 entries; give at least 2"),
+    (
+        MINIMAL + "world: {boxes: [{lower: [0, 5], upper: [1]}]}",
+        r"world.boxes\[0\].upper: \[1\] has 1 entries; give at least 2",
+    ),
     (
         MINIMAL + "world: {boxes: [{lower: [0, 5], upper: [1, 6, 7]}]}",
         r"world.boxes\[0\]: lower has 2 components and up",

@@ -19,14 +19,16 @@ import pytest
 from network_support import wait_until as until
 
 from d4orm_env import World, make_problem
+from d4orm_env.core.bodies import nearest
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
 from d4orm_env.disturbances.disturbance_registry import DISTURBANCES
+from d4orm_env.footprints import Box
 from d4orm_env.scenarios.problem_files import scenario_text
 from d4orm_planners.base.display import markdown_text
 from d4orm_planners.base.policy import GoToGoal
 from d4orm_planners.play import edits
 from d4orm_planners.play.session import Session
-from d4orm_planners.play.viewport import closest_approach
 
 TIMEOUT = 60.0
 
@@ -69,7 +71,7 @@ def test_a_robot_stands_where_it_is_put(scene: Problem) -> None:
     [
         (lambda p: edits.move_goal(p, 0, p.goal[1]), "the goal of robot_0 would touch that of robot_1"),
         (lambda p: edits.move_robot(p, 0, p.start[1, :2]), "the robot of robot_0 would touch that of robot_1"),
-        (lambda p: edits.move_goal(p, 0, [np.nan, 0]), "is at no position"),
+        (lambda p: edits.move_goal(p, 0, [np.nan, 0]), r"goal\[0, 0\] is nan"),
         (lambda p: edits.move_goal(p, 0, [1e5, 0]), "float32 resolves"),
         (edits.remove_obstacle, "there is no obstacle to remove"),
         (lambda p: edits.remove_robot(p.select([0])), "the last robot stays"),
@@ -88,13 +90,30 @@ def test_walls_stop_goals_and_robots(scene: Problem) -> None:
         edits.move_obstacle(walled, "boxes", 0, walled.start[0, :2])
 
 
+def test_rectangles_may_be_where_the_discs_round_them_would_touch() -> None:
+    """Boxes of 1 m by 0.2 m along x, 0.3 m beside each other and beside a wall."""
+    team = Team(("differential_drive",) * 2, footprint=Box(1.0, 0.2))
+    start, goal = [[0, 0, 0, 0], [0, 1, 0, 0]], [[5, 0], [5, 1]]
+    scene = Problem(team, start=start, goal=goal, world=World(boxes=[[-1, -0.6, 1, -0.4]]), goal_heading=0.0)
+    beside = edits.move_goal(edits.move_robot(scene, 1, [0, 0.3]), 1, [5, 0.3])
+    assert nearest(beside, beside.start) == pytest.approx(0.1, abs=1e-6)
+    nearer = edits.move_obstacle(beside, "boxes", 0, [0, 0.25])
+    assert nearest(nearer, nearer.start) == pytest.approx(0.05, abs=1e-6)
+    with pytest.raises(ValueError, match="the robot of robot_1 would touch that of robot_0"):
+        edits.move_robot(scene, 1, [0, 0.19])
+    with pytest.raises(ValueError, match="the goal of robot_1 would touch that of robot_0"):
+        edits.move_goal(scene, 1, [5.9, 0.0])
+    with pytest.raises(ValueError, match="the obstacle would touch the robot_0"):
+        edits.move_obstacle(scene, "boxes", 0, [0, 0.35])
+
+
 @pytest.mark.parametrize("scenario", ["circle", "sphere", "heterogeneous"])
 def test_robots_come_and_go(scenario: str, random: np.random.Generator) -> None:
     scene = make_problem(scenario, num_robots=4)
     more = edits.add_robot(scene, random)
     assert more.num_robots == 5
     assert more.team.models[4] == scene.team.models[0]
-    assert closest_approach(more, more.start) > 0
+    assert nearest(more, more.start) > 0
     again = edits.remove_robot(more)
     np.testing.assert_array_equal(again.goal, scene.goal)
     assert again.team.models == scene.team.models
@@ -106,7 +125,7 @@ def test_obstacles_come_and_go(scenario: str, kind: str, random: np.random.Gener
     scene = make_problem(scenario, num_robots=3)
     more = edits.add_obstacle(scene, kind, random)
     assert more.world.num_obstacles == 1
-    assert closest_approach(more, more.start) > 0
+    assert nearest(more, more.start) > 0
     assert edits.remove_obstacle(more).world.num_obstacles == 0
 
 
