@@ -132,8 +132,12 @@ class Planner(ABC):
             ValueError: If an argument makes no sense, or there is a watcher and another engine; the message names it.
         """
         check_is_problem(problem)
-        if callback is not None and not callable(callback):
-            raise ValueError(f"callback is {short_repr(callback)}; give a function of an IterationRecord")
+        for name, function, told in (
+            ("callback", callback, "an IterationRecord"),
+            ("watcher", watcher, "a DenoisingStep"),
+        ):
+            if function is not None and not callable(function):
+                raise ValueError(f"{name} is {short_repr(function)}; give a function of {told}")
         limit = None if time_limit is None else duration(time_limit, "time_limit")
         most = (
             self.config.max_iterations if max_iterations is None else whole_number(max_iterations, "max_iterations", 1)
