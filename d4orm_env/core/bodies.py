@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Ints, read_only
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Ints, read_only, short_repr
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.footprints import MAX_CORNERS, Core, Disc, Ellipsoid, Footprint, Planar, Polygon, Train
 
@@ -34,6 +34,25 @@ class Body(NamedTuple):
     heading: int | None  #: Number of the state component that turns it, or ``None`` for none
     #: Distance of a trailer's reference point behind that of the body before it [m]; zero for the robot itself
     hitch: float
+
+
+def check_footprints(footprints: Sequence[Footprint], models: Sequence[Model]) -> None:
+    """Refuse footprints that are none, of another dimension, or without a robot's trailers."""
+    for robot, (footprint, model) in enumerate(zip(footprints, models, strict=True)):
+        where = f"footprint of robot_{robot}"
+        if not isinstance(footprint, Footprint):
+            raise ValueError(f"{where} is {short_repr(footprint)}; give one such as Box(0.5, 0.25)")
+        if footprint.dimension != model.dimension and not isinstance(footprint, Disc):
+            raise ValueError(
+                f"{where}, {footprint}, lies in {footprint.dimension} dimensions and the team moves in "
+                f"{model.dimension}; choose another"
+            )
+        pulled = len(footprint.trailers) if isinstance(footprint, Train) else 0
+        if pulled != len(model.trailers):
+            raise ValueError(
+                f"{where} has {pulled} trailers, and a {model.name} pulls {len(model.trailers)}; give such as "
+                "Train(Box(0.5, 0.25), [Box(0.3, 0.25)])"
+            )
 
 
 def find_bodies(footprints: Sequence[Footprint], models: Sequence[Model], hitches: Iterable[float]) -> tuple[Body, ...]:

@@ -22,7 +22,7 @@ from d4orm_env.core.arrays import (
     short_repr,
     whole_number,
 )
-from d4orm_env.core.bodies import Body, FootprintArrays, as_arrays, body_poses, find_bodies
+from d4orm_env.core.bodies import Body, FootprintArrays, as_arrays, body_poses, check_footprints, find_bodies
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
 from d4orm_env.footprints import Disc, Footprint, Train
@@ -111,21 +111,7 @@ class Team(Frozen):
                 f"footprint has {len(footprints)} entries for {count} robots; give one for each, such as "
                 "Box(0.5, 0.25), or one for all"
             )
-        for robot, footprint in enumerate(footprints):
-            where = f"footprint of robot_{robot}"
-            if not isinstance(footprint, Footprint):
-                raise ValueError(f"{where} is {short_repr(footprint)}; give one such as Box(0.5, 0.25)")
-            if footprint.dimension != self.dimension and not isinstance(footprint, Disc):
-                raise ValueError(
-                    f"{where}, {footprint}, lies in {footprint.dimension} dimensions and the team moves in "
-                    f"{self.dimension}; choose another"
-                )
-            pulled = len(footprint.trailers) if isinstance(footprint, Train) else 0
-            if pulled != trailers[robot]:
-                raise ValueError(
-                    f"{where} has {pulled} trailers, and a {self.models[robot]} pulls {trailers[robot]}; give such as "
-                    "Train(Box(0.5, 0.25), [Box(0.3, 0.25)])"
-                )
+        check_footprints(footprints, self.robot_models)
         outer = [self._outer_radius(robot, footprint) for robot, footprint in enumerate(footprints)]
         radii = frozen_per_robot(outer, "radius", count)
         if radius is not None and (frozen_per_robot(radius, "radius", count) != radii).any():
