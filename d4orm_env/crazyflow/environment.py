@@ -108,7 +108,7 @@ class DroneBodies:
     def __init__(self, problem: Problem, intruder_radius: FloatArray, physics: DronePhysics) -> None:
         self.problem, self.intruder_radius, self._physics = problem, intruder_radius, physics
         self._flight = Flight(problem.num_robots, physics.drone, physics.mass_factor, physics.thrust_factor)
-        self._radius = problem.team.radius.astype(np.float64)
+        self._radius = problem.team.inner_radius  # the air that ellipsoids keep free is not simulated
         self._step = TimeStep(*problem.arrays.time_step)
         self.record = FlightRecord.empty(problem.num_robots)
 

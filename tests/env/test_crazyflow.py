@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from d4orm_env import Problem, Team, World, make_problem, navigation_v0
+from d4orm_env.footprints import Ellipsoid
 from d4orm_planners import make_planner, run_episode
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.policy import OpenLoop
@@ -118,6 +119,17 @@ def test_contacts_between_steps_and_falls_count() -> None:
     down = np.array([[0, 0.5, 0], [0.8, 0, 1]]) + np.zeros((100, 2, 3))
     touched = bodies.follow(down, 0 * down, 0 * down)
     assert touched.tolist() == bodies.record.fallen.tolist() == [True, False]
+
+
+@needs_crazyflow
+def test_the_air_that_ellipsoids_keep_free_is_no_body() -> None:
+    team = Team(("holonomic3d",) * 2, footprint=Ellipsoid(0.07, 0.07, 0.25))
+    problem = swap(team=team, start=[[0, 0.5, 1, 0, 0, 0], [0.3, 0.5, 1, 0, 0, 0]], goal=[[0, 0, 1], [0.8, 0, 1]])
+    env = crazyflow.parallel_env(problem=problem)
+    env.reset(seed=0)
+    env.step(dict.fromkeys(env.agents, np.zeros(3, np.float32)))
+    assert env.metrics()["collided"] == 0
+    assert env.flight.least_gap == pytest.approx([0.16] * 2, abs=0.02)
 
 
 @needs_crazyflow
