@@ -21,7 +21,8 @@ from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.policy_threads import ATTRIBUTE, driven_alone
 from d4orm_planners.base.provenance import attributes
 from d4orm_planners.base.settings import CheckedSettings
-from d4orm_planners.tracking.steering import drive_to_goal, limit_controls
+from d4orm_planners.tracking.goal_drives import drive_to_goal
+from d4orm_planners.tracking.steering import limit_controls
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv

@@ -17,7 +17,7 @@ from d4orm_env.envs.features import Features
 from d4orm_env.envs.joint_state import split_state
 from d4orm_planners.base.measured_states import acting_robots, stacked_observations
 from d4orm_planners.base.policy import Actions, Observations, Policy, within_limits
-from d4orm_planners.tracking.steering import brake_to_dock
+from d4orm_planners.tracking.goal_drives import brake_to_dock
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv

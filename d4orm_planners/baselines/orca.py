@@ -21,9 +21,9 @@ from d4orm_env.engine.observing import communication_links
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.settings import CheckedSettings, NotNegative, Positive, Whole
+from d4orm_planners.tracking.goal_drives import velocities_to_goals
 from d4orm_planners.tracking.steering import (
     goals_along_paths,
-    preferred_velocities,
     present_velocities,
     track_velocities,
 )
@@ -96,7 +96,7 @@ class Orca(StatePolicy):
         problem, goals = self.problem, joint.goals
         if self.config.shortest_paths:
             goals = goals_along_paths(problem, joint.states[:, : problem.dimension], goals)
-        preferred = preferred_velocities(problem, joint.states, goals)
+        preferred = velocities_to_goals(problem, joint.states, goals)
         preferred = np.einsum("ijk,kj->ki", self._turn, preferred)
         return track_velocities(problem, joint.states, self._avoid_known(joint, preferred))
 

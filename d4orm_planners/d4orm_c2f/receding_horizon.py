@@ -24,7 +24,8 @@ from d4orm_planners.d4orm_c2f.estimators import PROBE
 from d4orm_planners.d4orm_c2f.fine_plan import Prediction, Situation, Window
 from d4orm_planners.d4orm_c2f.settings import PAPER_CONTROL, D4ormC2FConfig
 from d4orm_planners.engine.sampling_types import get_sampling_engine
-from d4orm_planners.tracking.steering import drive_to_goal, present_velocities, track_velocities
+from d4orm_planners.tracking.goal_drives import drive_to_goal
+from d4orm_planners.tracking.steering import present_velocities, track_velocities
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv

@@ -18,7 +18,8 @@ from d4orm_planners.base.measured_states import acting_robots, stacked_observati
 from d4orm_planners.base.policy import Actions, Observations, Policy, within_limits
 from d4orm_planners.base.settings import CheckedSettings, PathText
 from d4orm_planners.rl.network import SUFFIX, Header, Network, load_network, range_sensors
-from d4orm_planners.tracking.steering import brake_to_dock, goals_along_paths
+from d4orm_planners.tracking.goal_drives import brake_to_dock
+from d4orm_planners.tracking.steering import goals_along_paths
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv

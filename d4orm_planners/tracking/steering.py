@@ -1,4 +1,4 @@
-"""Tracking a velocity, and driving straight to the goal as if alone: one law for every model."""
+"""Tracking a velocity, and driving straight to a point as if alone: one law for every model."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from d4orm_env.core.team import Team
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import OWN_LIMITS, STANDARD_LIMITS, UNLIMITED, Model, ModelFunctions
 from d4orm_env.dynamics.transition import TimeStep
-from d4orm_env.envs.joint_state import JointState
 from d4orm_env.paths.shortest_paths import along_paths
 
 Rows = TypeVar("Rows", FloatArray, Floats)
@@ -38,11 +37,6 @@ NEAR_VIA = 10 / 3
 """Distance to a point on its way at which a robot turns to its goal, in radii of the largest robot."""
 
 
-def drive_to_goal(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
-    """``(K, m)`` controls inside each robot's limits, from states ``(K, n)`` to goals ``(K, d)`` [m]."""
-    return track_velocities(problem, states, preferred_velocities(problem, states, goals))
-
-
 def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
     """``(K, d)`` velocities straight to goals ``(K, d)`` [m], from which robots in ``states`` ``(K, n)`` can still stop
     there [m/s]. At its goal a robot turns to its goal heading.
@@ -56,6 +50,7 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
         return wanted
     offset = goals - states[:, : problem.dimension]
     turning = ~np.isnan(problem.goal_heading) & ((offset * offset).sum(axis=1) <= problem.arrays.squared_goal_radius)
+    turning &= problem.team.turning_radius == 0
     creep = problem.team.max_speed[:, None] * CREEPING * directions[:, :2]
     return np.where(turning[:, None], creep, wanted)
 
@@ -196,12 +191,6 @@ def braking_share(problem: Problem, velocities: Floats, accelerations: Floats) -
     brakes = np.clip(-along / team.max_acceleration, 0.0, 1.0)[inertia]
     shares = (can / np.maximum(speeds, can))[inertia]
     return float(min(shares, default=1.0) * (1 - max(brakes, default=0.0) / 2))
-
-
-def brake_to_dock(problem: Problem, robots: list[int], controls: FloatArray, joint: JointState) -> FloatArray:
-    """``(N, m)`` the controls of some robots, replaced by those of go-to-goal for robots that must brake now."""
-    braking = must_brake(problem, joint.states, joint.controls, joint.goals)[robots, None]
-    return np.where(braking, drive_to_goal(problem, joint.states, joint.goals)[robots], controls)
 
 
 def short_way_round(problem: Problem, differences: Rows) -> Rows:

@@ -1,0 +1,81 @@
+"""Cars drive to goal headings by curves, whatever policy steers them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from d4orm_env import Problem, Team, navigation_v0
+from d4orm_planners import run_episode
+from d4orm_planners.tracking.goal_drives import drive_to_goal
+from d4orm_planners.tracking.pose_curves import CUSP, STRAIGHT, curves, first_stretches
+from d4orm_planners.tracking.steering import preferred_velocities, track_velocities
+
+CARS = ("car", "car_first_order", "car_with_1_trailer", "car_with_3_trailers")
+TURNS = {"ahead": 0.0, "opposite": np.pi, "sideways": np.pi / 2}
+
+
+def poses(count: int, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    random = np.random.default_rng(0)
+    return random.uniform(-reach, reach, count), random.uniform(-reach, reach, count), random.uniform(-4, 4, count)
+
+
+def off(ends: np.ndarray, x: np.ndarray, y: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """How far poses ``(..., 3)`` are from others, radians as metres."""
+    turned = (ends[..., 2] - turns + np.pi) % (2 * np.pi) - np.pi
+    return np.abs(ends[..., 0] - x) + np.abs(ends[..., 1] - y) + np.abs(turned)
+
+
+@pytest.mark.parametrize("reach", [0.1, 1.0, 4.0, 30.0])
+def test_curves_lead_to_the_goal(reach: float) -> None:
+    x, y, turns = poses(500, reach)
+    sides, lengths = curves(x, y, turns, np.zeros(500))
+    exists = np.isfinite(lengths).all(axis=-1)
+    assert exists.any(axis=0).all()
+    assert (lengths[exists] >= 0)[sides[exists] == STRAIGHT].all()  # straights are driven forwards
+    ends = np.zeros((*exists.shape, 3))
+    for side, length in zip(np.moveaxis(sides, -1, 0), np.moveaxis(np.where(exists[..., None], lengths, 0), -1, 0)):
+        before, bent = ends[..., 2].copy(), side != STRAIGHT
+        ends[..., 2] += side * length
+        radius = np.where(bent, side, 1)
+        ends[..., 0] += np.where(bent, radius * (np.sin(ends[..., 2]) - np.sin(before)), length * np.cos(before))
+        ends[..., 1] -= np.where(bent, radius * (np.cos(ends[..., 2]) - np.cos(before)), -length * np.sin(before))
+    assert off(ends, x, y, turns)[exists].max() < 1e-6 * max(reach, 1)
+
+
+def test_no_curve_is_longer_than_it_needs_be() -> None:
+    # A turn on the spot, nearly: forwards, back and forwards again, each by a third of it.
+    side, length = first_stretches(np.zeros(1), np.zeros(1), np.array([0.3]), np.full(1, 1e-3), np.full(1, np.nan))
+    _, lengths = curves(np.zeros(1), np.zeros(1), np.array([0.3]), np.full(1, 1e-3))
+    assert np.abs(lengths).sum(axis=-1).min() == pytest.approx(0.3, rel=1e-3)
+    assert abs(length[0]) < 0.3
+    assert side[0] != STRAIGHT
+    assert CUSP > 0
+
+
+@pytest.mark.parametrize("model", CARS)
+@pytest.mark.parametrize("turn", TURNS.values(), ids=TURNS)
+def test_cars_arrive_with_their_headings(model: str, turn: float) -> None:
+    random, size = np.random.default_rng(1), 12
+    team = Team((model,) * size)
+    apart, start = 30.0 * np.arange(size), np.zeros((size, team.robot_models[0].state_size))
+    bearing = random.uniform(-np.pi, np.pi, size)
+    goal = np.stack([np.cos(bearing), np.sin(bearing)], axis=1) * random.uniform(0, 3, (size, 1))
+    start[:, 0], start[:, 2] = apart, random.uniform(-np.pi, np.pi, size)
+    goal[:, 0] += apart
+    heading = (bearing + turn + np.pi) % (2 * np.pi) - np.pi
+    problem = Problem(team, start, goal, goal_heading=heading, horizon=400)
+    episode = run_episode(navigation_v0.parallel_env(problem=problem), "go-to-goal")
+    assert episode.trajectory.arrived[-1].all()
+
+
+def test_others_drive_straight() -> None:
+    team = Team(("car", "differential_drive", "car_first_order"))
+    start = [[0, 0, 1, 0.3, 0.1], [3, 0, 1, 0.2, 0], [6, 0, 2, 0, 0]]
+    goals, headings = np.float32([[1, 1], [4, 1], [7, 1]]), [np.nan, 1.0, np.nan]
+    problem = Problem(team, start, goals, goal_heading=headings)
+    straight = track_velocities(problem, problem.start, preferred_velocities(problem, problem.start, goals))
+    np.testing.assert_array_equal(drive_to_goal(problem, problem.start, goals), straight)
+    curving = problem.replace(goal_heading=[3.0, 1.0, np.nan])
+    np.testing.assert_array_equal(drive_to_goal(curving, problem.start, goals)[1:], straight[1:])
+    assert (drive_to_goal(curving, problem.start, goals)[0] != straight[0]).any()
