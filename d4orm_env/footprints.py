@@ -275,7 +275,7 @@ class Train(Footprint):
     trailers: tuple[Disc | Planar, ...]
 
     def __init__(self, front: Disc | Planar, trailers: Sequence[Disc | Planar]) -> None:
-        if not isinstance(trailers, Sequence):
+        if isinstance(trailers, str) or not isinstance(trailers, Sequence):
             raise ValueError(f"trailers of Train are {short_repr(trailers)}; give a list of footprints, one each")
         for footprint in (front, *trailers):
             if not isinstance(footprint, Disc | Planar):

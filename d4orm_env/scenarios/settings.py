@@ -196,8 +196,11 @@ def parsed(content: object) -> Footprint:
         raise ValueError(f"footprint {content['shape']} lacks {', '.join(lacking)}; it has {', '.join(known)}")
     try:
         if kind is Train:
-            bodies: list[Any] = [parsed(sizes.pop("front")), *map(parsed, sizes.pop("trailers"))]
-            return Train(bodies[0], bodies[1:], **sizes)
+            front: Any = parsed(sizes["front"])
+            trailers: Any = sizes["trailers"]
+            if isinstance(trailers, list | tuple):
+                trailers = [*map(parsed, trailers)]
+            return Train(front, trailers)
         return kind(**sizes)
-    except (TypeError, KeyError) as error:
+    except TypeError as error:
         raise ValueError(f"footprint {content['shape']}: {error}") from None

@@ -311,6 +311,13 @@ def test_fields_of_a_footprint_in_a_file_are_checked(content: dict[str, Any], me
         parsed(content)
 
 
+@pytest.mark.parametrize("trailers", [3, None, "box", {"shape": "disc", "radius": 0.1}])
+def test_trailers_in_a_file_are_a_list(trailers: object) -> None:
+    told = re.escape(f"trailers of Train are {trailers!r}; give a list of footprints, one each")
+    with pytest.raises(ValueError, match=told):
+        parsed({"shape": "train", "front": {"shape": "disc", "radius": 0.1}, "trailers": trailers})
+
+
 def test_what_is_no_team_or_no_polygon_is_told() -> None:
     with pytest.raises(ValueError, match=r"team is 5; give a Team, as make_team\(\) returns"):
         Problem(5, [[0]], [[0]])  # type: ignore[arg-type]
