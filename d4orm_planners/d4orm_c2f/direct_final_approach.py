@@ -10,6 +10,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.types import Engine
+from d4orm_planners.tracking.goal_drives import drive_to_goal
 from d4orm_planners.tracking.steering import NEAR_VIA, at_rest, drives, straight_drives
 
 PASSING = 1 / 75_000
@@ -73,8 +74,37 @@ def direct_final_approach(
         controls = np.where(sooner[:, None], straight, controls)
         final |= sooner
     close &= ~final & (latest == window.horizon)
-    controls, manoeuvring = approach_by_manoeuvres(window, controls, np.flatnonzero(close), arrived)
-    return controls, final | manoeuvring
+    headed = close & ~np.isnan(window.goal_heading)
+    controls, curving = _approach_by_curves(window, engine, controls, np.flatnonzero(headed), arrived)
+    controls, manoeuvring = approach_by_manoeuvres(window, controls, np.flatnonzero(close & ~headed), arrived)
+    return controls, final | curving | manoeuvring
+
+
+def _approach_by_curves(
+    window: Problem, engine: Engine, controls: FloatArray, robots: IntArray, arrived: BoolArray
+) -> tuple[FloatArray, BoolArray]:
+    """The controls, with curves to their goal headings for robots ``(R,)``, as far as these keep clear of all at rest.
+
+    The rest is as for :func:`approach_by_manoeuvres`. Curves take longer than the prediction, and the next loop goes on
+    with the same ones.
+    """
+    curving = np.zeros_like(arrived)
+    if not len(robots):
+        return controls, curving
+    alone = window.select(robots.tolist())
+    driven = np.zeros((len(controls), len(robots), alone.control_size), np.float32)
+    states, docked = alone.start, np.zeros(len(robots), bool)
+    for step in range(len(driven)):
+        states, driven[step], docked, *_ = engine.step(
+            alone.arrays, states, docked, drive_to_goal(alone, states, alone.goal)
+        )
+    positions = engine.move(alone.arrays, alone.start, np.zeros(len(robots), bool), driven)[
+        :, :, None, : window.dimension
+    ]
+    curving[robots] = _keeps_clear(window, positions, robots, arrived)[:, 0]
+    controls, own = controls.copy(), curving[robots]
+    controls[:, robots[own], : driven.shape[2]] = driven[:, own]
+    return controls, curving
 
 
 def approach_by_manoeuvres(

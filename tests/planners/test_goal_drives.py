@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from d4orm_env import Problem, Team, navigation_v0
+from d4orm_env.engine.choice import get_engine
 from d4orm_planners import run_episode
+from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
 from d4orm_planners.tracking.goal_drives import drive_to_goal
 from d4orm_planners.tracking.pose_curves import CUSP, STRAIGHT, curves, first_stretches
 from d4orm_planners.tracking.steering import preferred_velocities, track_velocities
@@ -79,3 +81,17 @@ def test_others_drive_straight() -> None:
     curving = problem.replace(goal_heading=[3.0, 1.0, np.nan])
     np.testing.assert_array_equal(drive_to_goal(curving, problem.start, goals)[1:], straight[1:])
     assert (drive_to_goal(curving, problem.start, goals)[0] != straight[0]).any()
+
+
+def test_the_final_approach_mends_a_heading() -> None:
+    # At its goal, but 0.3 rad off: further than samples look it has to drive away and come back.
+    problem = Problem(Team(("car",)), [[0, 0, 0.3, 0, 0]], [[0, 0]], goal_heading=0.0, horizon=20)
+    engine, everyone, states = get_engine("cpu"), np.ones(1, bool), problem.start
+    for _ in range(200):
+        window = problem.with_state(states, problem.goal)
+        nothing = np.zeros((20, 1, 2), np.float32)
+        controls, _ = direct_final_approach(window, engine, nothing, everyone, ~everyone)
+        states, _, arrived, *_ = engine.step(problem.arrays, states, ~everyone, controls[0])
+        if arrived.all():
+            return
+    pytest.fail(f"it is still at {states.tolist()}")
