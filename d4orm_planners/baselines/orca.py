@@ -21,7 +21,7 @@ from d4orm_env.engine.observing import communication_links
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.settings import CheckedSettings, NotNegative, Positive, Whole
-from d4orm_planners.tracking.goal_drives import velocities_to_goals
+from d4orm_planners.tracking.goal_drives import curving, velocities_to_goals
 from d4orm_planners.tracking.steering import (
     goals_along_paths,
     present_velocities,
@@ -96,8 +96,11 @@ class Orca(StatePolicy):
         problem, goals = self.problem, joint.goals
         if self.config.shortest_paths:
             goals = goals_along_paths(problem, joint.states[:, : problem.dimension], goals)
+        by_curves, positions = curving(problem)[:, None], joint.states[:, :2]
+        if by_curves.any():  # a velocity that is turned means other wheels, or another gear
+            goals = np.where(by_curves, positions + np.einsum("ijk,kj->ki", self._turn, goals - positions), goals)
         preferred = velocities_to_goals(problem, joint.states, goals)
-        preferred = np.einsum("ijk,kj->ki", self._turn, preferred)
+        preferred = np.where(by_curves, preferred, np.einsum("ijk,kj->ki", self._turn, preferred))
         return track_velocities(problem, joint.states, self._avoid_known(joint, preferred))
 
     def _avoid_known(self, joint: JointState, preferred: FloatArray) -> FloatArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.tracking.pose_curves import first_stretches
@@ -43,8 +43,7 @@ def velocities_to_goals(problem: Problem, states: FloatArray, goals: FloatArray)
 
     Nothing is remembered: where a robot does not follow a curve, it goes on by the one from where it is.
     """
-    circle = problem.team.turning_radius
-    robots = np.flatnonzero(~np.isnan(problem.goal_heading) & (circle > 0) & np.isfinite(circle))
+    circle, robots = problem.team.turning_radius, np.flatnonzero(curving(problem))
     if not len(robots):
         return preferred_velocities(problem, states, goals)
     radius, headings = (part[robots].astype(np.float64) for part in (circle, problem.team.headings(states)))
@@ -59,6 +58,12 @@ def velocities_to_goals(problem: Problem, states: FloatArray, goals: FloatArray)
     off = np.nan_to_num(np.abs(side - wheels))
     velocities[robots] *= np.maximum(1 - STEERING_FIRST * off, CREEPING)[:, None]
     return velocities
+
+
+def curving(problem: Problem) -> BoolArray:
+    """``(K,)`` robots with a goal heading that turn only as they drive."""
+    circle = problem.team.turning_radius
+    return ~np.isnan(problem.goal_heading) & (circle > 0) & np.isfinite(circle)
 
 
 def _turned(vectors: Floats, angles: Floats) -> Floats:

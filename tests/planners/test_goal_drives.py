@@ -71,6 +71,12 @@ def test_cars_arrive_with_their_headings(model: str, turn: float) -> None:
     assert episode.trajectory.arrived[-1].all()
 
 
+def test_orca_alone_does_too() -> None:
+    problem = Problem(Team(("car_first_order",)), [[0, 0, 0]], [[2, 0]], goal_heading=np.pi, horizon=200)
+    for seed in range(3):
+        assert run_episode(navigation_v0.parallel_env(problem=problem), "orca", seed).trajectory.arrived[-1].all()
+
+
 def test_others_drive_straight() -> None:
     team = Team(("car", "differential_drive", "car_first_order"))
     start = [[0, 0, 1, 0.3, 0.1], [3, 0, 1, 0.2, 0], [6, 0, 2, 0, 0]]
