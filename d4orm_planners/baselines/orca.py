@@ -24,6 +24,7 @@ from d4orm_planners.base.settings import CheckedSettings, NotNegative, Positive,
 from d4orm_planners.tracking.goal_drives import curving, velocities_to_goals
 from d4orm_planners.tracking.steering import (
     goals_along_paths,
+    preferred_velocities,
     present_velocities,
     track_velocities,
 )
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 
 pyrvo: Any = LazyModule("pyrvo", "policy 'orca'", "orca")
 
+NEARBY = 4.0
+"""Distance from its goal within which a robot goes by curves to its goal heading, in radii of its turning circle."""
 CORNERS = 16
 """Corners of the polygons that stand for round obstacles and robots at rest."""
 
@@ -96,11 +99,11 @@ class Orca(StatePolicy):
         problem, goals = self.problem, joint.goals
         if self.config.shortest_paths:
             goals = goals_along_paths(problem, joint.states[:, : problem.dimension], goals)
-        by_curves, positions = curving(problem)[:, None], joint.states[:, :2]
-        if by_curves.any():  # a velocity that is turned means other wheels, or another gear
-            goals = np.where(by_curves, positions + np.einsum("ijk,kj->ki", self._turn, goals - positions), goals)
-        preferred = velocities_to_goals(problem, joint.states, goals)
-        preferred = np.where(by_curves, preferred, np.einsum("ijk,kj->ki", self._turn, preferred))
+        offsets = goals - joint.states[:, :2]
+        near = np.linalg.norm(offsets, axis=1) < NEARBY * problem.team.turning_radius
+        preferred = np.einsum("ijk,kj->ki", self._turn, preferred_velocities(problem, joint.states, goals))
+        if (by_curves := curving(problem) & near).any():
+            preferred = np.where(by_curves[:, None], velocities_to_goals(problem, joint.states, goals), preferred)
         return track_velocities(problem, joint.states, self._avoid_known(joint, preferred))
 
     def _avoid_known(self, joint: JointState, preferred: FloatArray) -> FloatArray:
