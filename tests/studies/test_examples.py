@@ -24,13 +24,13 @@ import numpy as np
 import pytest
 import yaml
 from examples.common import save_table
-from examples.studies import draw_dynobench, dynobench, lifelong, solve_rates
+from examples.studies import lifelong, solve_rates
 from examples.studies.paper.variants import CountedIpopt, ForgetfulC2F
 from examples.studies.settings_studies import irregular_circle
 from matplotlib.figure import Figure
 from PIL import Image
 
-from d4orm_env import load_dynobench, make_problem, navigation_v0, rollout
+from d4orm_env import make_problem, navigation_v0, rollout
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners import Plan, make_planner, make_policy, run_episode
 from d4orm_planners.evaluation.tables import read_parquet
@@ -345,7 +345,7 @@ def test_algorithm_4_has_one_thing_changed_at_a_time(tmp_path: Path) -> None:
     configs = {
         trial.label: json.loads(trial.config) for trial in read_parquet(tmp_path / "out/algorithm_4_parts.parquet")
     }
-    assert [row["controller"] for row in rows] == list(configs)
+    assert list(dict.fromkeys(row["controller"] for row in rows)) == list(configs)
     written = configs["as written"]
     changed = {label: {key for key in config if config[key] != written.get(key)} for label, config in configs.items()}
     assert changed["guidance not refined"] == {"refine"}
@@ -372,7 +372,7 @@ def test_a_controller_that_forgets_begins_every_window_with_no_controls() -> Non
 def test_ipopt_tells_its_own_iterations(tmp_path: Path) -> None:
     pytest.importorskip("casadi")
     rows = made("ipopt_starts", tmp_path)
-    assert [row["p (iterations)"] for row in rows] == 2 * ["1", "1", "-"] + ["-"] * 3
+    assert [row["p (iterations)"] for row in rows] == 2 * ["1", "1", "-"] + ["1", "1", "-", "-"]
     assert all(5 < int(row["iterations"]) < 500 for row in rows)
     check_made_again("ipopt_starts", tmp_path, rows)
     problem = make_problem("circle", num_robots=2)
