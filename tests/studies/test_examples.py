@@ -24,13 +24,13 @@ import numpy as np
 import pytest
 import yaml
 from examples.common import save_table
-from examples.studies import lifelong, solve_rates
+from examples.studies import draw_dynobench, dynobench, lifelong, solve_rates
 from examples.studies.paper.variants import CountedIpopt, ForgetfulC2F
 from examples.studies.settings_studies import irregular_circle
 from matplotlib.figure import Figure
 from PIL import Image
 
-from d4orm_env import make_problem, navigation_v0, rollout
+from d4orm_env import load_dynobench, make_problem, navigation_v0, rollout
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners import Plan, make_planner, make_policy, run_episode
 from d4orm_planners.evaluation.tables import read_parquet
