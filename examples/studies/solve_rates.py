@@ -216,7 +216,6 @@ def main() -> None:
         save_table(summary(own), arguments.out / f"solve_rates_{name}.csv")
     shown = [row for row in rows if row["team"] in README.get(row["set"], ())]
     if shown:
-        columns = ("team", "planner", "solved", "denoising steps", "denoising, time", "first plan [s] (median, most)",
-                   "travel time [s]", "least [s]")  # fmt: skip
+        columns = ("team", "planner", "solved", "first plan [s] (median, most)", "travel time [s]", "least [s]")
         table = [{name: row[name] for name in columns} for row in summary(shown)]
         save_table(table, arguments.out / "solve_rates.csv")
