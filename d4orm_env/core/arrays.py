@@ -36,8 +36,9 @@ def read_only(arrays: A) -> A:
 
 
 def as_float32(value: ArrayLike) -> FloatArray:
-    """A new float32 array of ``value``, PyTorch's tensors included, too large ones infinite; ValueError for what is
-    none.
+    """A new float32 array of ``value``, PyTorch's tensors included; what is too large for float32 becomes infinite.
+
+    What cannot be read as numbers, or is a whole number that no float holds, is a ValueError.
     """
     try:
         with np.errstate(over="ignore"):

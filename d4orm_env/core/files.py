@@ -40,8 +40,9 @@ def make_folder(folder: Path) -> None:
 
 
 def require_file(path: Path, kind: str) -> None:
-    """Refuse a folder, a pipe or a device, whose reading may never end, in place of a ``kind``; without a file it
-    passes.
+    """Refuse a folder, a pipe or a device, whose reading may never end, in place of a ``kind`` such as ``"a map"``.
+
+    A path without a file passes.
     """
     if path.exists() and not path.is_file():
         raise ValueError(f"is not a file; give the path of {kind}")
@@ -59,7 +60,10 @@ def read_limited(path: Path, kind: str, most: int) -> bytes:
 
 @contextmanager
 def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Raise errors within as a ``ValueError`` of one line that begins with the path, or MissingFileError."""
+    """Raise errors within as a ``ValueError`` of one line that begins with the path of the file.
+
+    For a file that does not exist it is a ``FileNotFoundError`` too.
+    """
     try:
         yield
     except ValueError as error:
@@ -121,8 +125,9 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
 
 
 def claim_folder(path: Path, identity: Mapping[str, object], kind: str, remedy: str = "choose another folder") -> None:
-    """Write the purpose of a folder of a ``kind`` to a JSON file, or refuse another one's, with the ``remedy`` at the
-    end.
+    """Write the purpose of a folder, which holds ``kind``, to a JSON file at ``path``, or check that it is the same.
+
+    A folder for something else is a ValueError, which ends with the ``remedy``.
     """
     wanted = json.loads(json.dumps(identity))
     if not path.exists():

@@ -68,10 +68,8 @@ def _see_itself(k: int, arrays: ProblemArrays, goal: FloatArray, sensed: Sensed,
 
 
 def _see_goal_heading(k: int, directions: FloatArray | None, heading: FloatArray, i: int, out: FloatArray) -> int:
-    """Fill the goal heading less the robot's own, from component ``i`` on.
-
-    Returns:
-        Number of components: none where no robot has a goal heading.
+    """Fill the goal heading less the robot's own, from component ``i`` on, if any has one; return the number of
+    components.
     """
     if directions is None:
         return 0

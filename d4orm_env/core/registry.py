@@ -140,7 +140,10 @@ def installed() -> Any:
 
 
 def load_reference(text: str) -> object:
-    """Load ``"package.module:Name"`` or ``"folder/file.py:Name"``, of the present folder too; else a ValueError."""
+    """Load ``"package.module:Name"`` or ``"folder/file.py:Name"``; modules of the present folder are found too.
+
+    Text of another form, or of which nothing can be imported, is a ValueError.
+    """
     module, _, name = text.rpartition(":")
     if not module or not all(part.isidentifier() for part in name.split(".")):
         raise ValueError(f"{text!r} is no import path; give {FORMS}")
@@ -197,7 +200,9 @@ def _qualified_name(thing: object) -> object:
 
 
 def source_digest(thing: object) -> str:
-    """SHA-256 of the file in which a class, a function or an instance's class is written; ValueError without one."""
+    """SHA-256 of the file in which a class, a function or an instance's class is written; ValueError where there is
+    none.
+    """
     code = source_object(thing)
     try:
         file = inspect.getsourcefile(code)

@@ -20,7 +20,10 @@ def team_text(models: Iterable[str]) -> str:
 
 
 def outcome_rows(metrics: dict[str, float], num_robots: int) -> list[KeyFigure]:
-    """The key figures of a plan or an episode that are among the metrics: arrivals, what went wrong, and times."""
+    """The key figures of a plan or an episode: what arrived, what went wrong, and how long it took.
+
+    Metrics that it lacks are left out.
+    """
     texts = {
         "arrived": ("arrived", f"{{:.0f}} of {num_robots}"),
         "collided": ("in contact", "{:.0f}"),

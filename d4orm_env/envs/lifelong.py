@@ -71,7 +71,9 @@ def given_goal(
     goals: FloatArray,
     random: np.random.Generator,
 ) -> FloatArray:
-    """A goal ``(d,)`` that a function of a user's gives; ValueError unless it is free and in :func:`goal_region`."""
+    """A goal ``(d,)`` that a function of a user's gives; ValueError unless it is a position of :func:`goal_region` with
+    room.
+    """
     name, given = f"the next goal of robot_{robot}", function(problem, robot, positions.copy(), goals.copy(), random)
     goal, (low, high) = frozen_array(given, name, (problem.dimension,)), goal_region(problem)
     if ((goal < low) | (goal > high)).any():

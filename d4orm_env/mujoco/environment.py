@@ -109,7 +109,10 @@ RENDERERS = ("auto", "mujoco", "pictures")
 
 
 class MujocoViewer(Viewer):
-    """Draws by one of :data:`RENDERERS`; ``"auto"`` becomes what is there when the first frame is drawn."""
+    """Draws a simulation in the environment's render mode, by one of :data:`RENDERERS`.
+
+    ``"auto"`` becomes what is there when the first frame is drawn.
+    """
 
     def __init__(self, render_mode: str | None, renderer: str) -> None:
         super().__init__(render_mode)

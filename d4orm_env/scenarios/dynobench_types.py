@@ -70,7 +70,10 @@ SIZES = {"size": 2, "size_trailer": 2, "hitch_lengths": 1}
 
 
 def checked_types(models: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Robot types by name with the parameters that they need, checked: a ValueError names type and parameter."""
+    """Robot types by name, each with all parameters that its dynamics and its shape need; others are left alone.
+
+    One that is missing, misspelt or no such number is a ValueError that names it and the type.
+    """
     if not isinstance(models, Mapping):
         raise ValueError(f"models is {short_repr(models)}; give parameters by type, as {{'mine': {{'dynamics': ...}}}}")
     for name, own in models.items():

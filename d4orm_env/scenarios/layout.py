@@ -266,8 +266,9 @@ def round_up(value: float) -> str:
 def _with_another(
     random: np.random.Generator, area: PlacementArea, points: Floats, spacing: float, *others: tuple[Floats, float]
 ) -> Floats:
-    """``points`` and a random one, if there is room, further than ``spacing`` from each, and as far as said from
-    ``others``.
+    """``points`` and a random one further than ``spacing`` from each, or just ``points`` if there is no room.
+
+    It keeps a distance of their own from each of ``others`` too.
     """
 
     def is_free(candidates: Floats) -> BoolArray:

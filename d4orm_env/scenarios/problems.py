@@ -266,8 +266,9 @@ def find_scenario(scenario: ScenarioLike) -> Scenario:
 
 
 def unknown_argument(scenario: ScenarioLike | None, names: Iterable[str], others: Iterable[str] = ()) -> str:
-    """Describe the first of ``names`` that neither the scenario, any for ``None``, nor ``others`` take; ``""`` for
-    none.
+    """Describe the first of ``names`` that neither the scenario nor the caller, ``others``, takes; ``""`` for none.
+
+    ``None`` is any of the registered scenarios.
     """
     if scenario is not None:
         return find_scenario(scenario).complaint(names, others)

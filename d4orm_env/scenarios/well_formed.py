@@ -96,7 +96,10 @@ def _last_reached(inside: BoolArray, begin: IntArray, kinds: Sequence[IntArray])
 
 @lru_cache(maxsize=4)
 def free_space(world: World, safety_distance: float, step: float) -> FreeSpace:
-    """The free space of a bounded world for centres that keep ``safety_distance`` [m], by a lattice of ``step`` [m]."""
+    """The free space of a world with bounds for robots whose centres keep ``safety_distance`` to everything [m].
+
+    The lattice begins at the lower bounds, in steps of ``step`` [m].
+    """
     low, high = world.bounds.astype(np.float64)
     shape = ((high - low) / step + 1).astype(int)
     if np.prod(shape, dtype=np.float64) > MAX_POINTS:

@@ -94,7 +94,9 @@ def polygon_distance(points: Floats, corners: Floats) -> Floats:
 
 
 def polygon_approach(start: Floats, end: Floats, corners: Floats) -> tuple[Floats, Floats]:
-    """:func:`closest_approach` by the signed distance to a simple polygon; zero where a chord crosses its outline."""
+    """:func:`closest_approach` by the signed distance to a simple polygon; where a chord crosses its outline from
+    outside to outside, zero at the crossing.
+    """
     before, after = polygon_distance(start, corners), polygon_distance(end, corners)
     smallest, fraction = np.minimum(before, after), (after < before).astype(np.float64)
     move = end - start

@@ -69,8 +69,9 @@ class Episode(DisplayMixin):
 
 
 def open_env(problem: Problem, physics: str = "model", policy: Policy | None = None, **options: Any) -> ParallelEnv:
-    """An environment of a problem by :func:`find_physics`; if ``options`` do not say, robots observe what the policy
-    wants.
+    """An environment of a problem, by :func:`find_physics`; ``options`` are those of the PettingZoo environment.
+
+    Where these say nothing, robots observe what the policy that is to act in it wants them to.
     """
     module, bodies = find_physics(physics, problem)
     if isinstance(policy, Policy):  # a user's own may have no more than reset and act

@@ -40,7 +40,9 @@ def robots_by_agent(num_robots: int) -> dict[str, int]:
 
 
 def acting_robots(policy: object, observations: Mapping[str, object]) -> list[int]:
-    """Numbers of the robots that a policy is asked for; ValueError for others, RuntimeError before its reset."""
+    """Numbers of the robots that a policy is asked for; ValueError if observations are not by agent, RuntimeError
+    before reset.
+    """
     problem: Problem | None = getattr(policy, "problem", None)
     if problem is None:
         raise RuntimeError("the policy has seen no environment yet; call reset(env) before act()")

@@ -102,7 +102,9 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
 
 
 def find_policy(policy: object) -> object:
-    """The thing that a policy's name or import path stands for, else a ValueError; all but text as it is."""
+    """Return the thing that a policy's name or import path stands for, else a ValueError; all but text is returned as
+    it is.
+    """
     if is_brought(policy):
         return policy
     if isinstance(policy, str):
@@ -212,7 +214,9 @@ def _policy_config(kind: object, config_class: type[Config], given: Mapping[str,
 def _configured(
     config_class: type[Config], presets: Presets, preset: object, config: Mapping[str, object], owner: str
 ) -> Config:
-    """Settings as given, on top of a preset's; ValueError for what makes no sense, TypeError for an unknown setting."""
+    """Settings as given, on top of those of a preset; ValueError or, for an unknown setting, TypeError for what makes
+    no sense.
+    """
     if preset is not None and not (isinstance(preset, str) and preset in presets):
         remedy = f"choose one of {', '.join(presets)}" if presets else "it has none, so leave it out"
         raise ValueError(f"preset {short_repr(preset)} of {owner} is unknown; {remedy}{did_you_mean(preset, presets)}")

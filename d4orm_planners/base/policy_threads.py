@@ -90,7 +90,10 @@ def driven_alone(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class Background(Generic[Result]):
-    """A job at a time in a thread of its own, which leaves other cores and goes last if it is ``yielding``."""
+    """A job at a time in a thread of its own.
+
+    If ``yielding``, it leaves other cores, and their threads, to others, which go first where threads have priorities.
+    """
 
     def __init__(self, yielding: bool = False) -> None:
         self._initializer = _yield_to_others if yielding else None

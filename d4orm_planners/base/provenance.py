@@ -56,8 +56,9 @@ def versions(names: Iterable[str]) -> dict[str, str]:
 
 
 def commit() -> str:
-    """The commit of this checkout, with ``+`` behind it where files differ; empty without git, or when installed
-    elsewhere.
+    """The commit of the checkout that this package is run from, with ``+`` behind it where files differ from it.
+
+    Empty for a package that is installed elsewhere, and without git.
     """
     package = Path(__file__).parents[1]
     if not (package.parent / ".git").exists():

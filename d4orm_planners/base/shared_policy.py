@@ -177,7 +177,9 @@ def loaded(model: Model, method: str = "state_dict") -> Model:
 
 
 def _checked_actions(answer: Any, count: int) -> FloatArray:
-    """Actions ``(count, m)`` that a model answers with; ValueError for all else, as those of a recurrent network."""
+    """Actions ``(count, m)`` that a model answers with; ValueError for all else, as actions with a recurrent network's
+    state.
+    """
     with contextlib.suppress(ValueError):
         if not isinstance(answer, tuple) and (actions := as_float32(answer)).shape[:-1] == (count,):
             return actions

@@ -54,7 +54,9 @@ class Swarm:
         self.violation = 0.0
 
     def run(self, engine: Engine, should_stop: Callable[[], bool]) -> FloatArray:
-        """``(H, K, m)`` controls, planned and driven until all have arrived or it must stop, and then zero."""
+        """``(H, K, m)`` controls, planned and driven step by step until all have arrived or it must stop; the rest is
+        zero.
+        """
         problem = self._problem
         controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
         states, arrived = np.asarray(problem.start), np.zeros(problem.num_robots, bool)

@@ -115,8 +115,9 @@ class Orca(StatePolicy):
         return np.stack([self._avoid(joint, preferred, team)[robot] for robot, team in enumerate(alone)])
 
     def _avoid(self, joint: JointState, preferred: FloatArray, team: IntArray) -> FloatArray:
-        """``(K, 2)`` velocities of these robots, nearest to the preferred ones, that avoid everything; zero for all
-        others.
+        """``(K, 2)`` velocities of these robots, nearest to the preferred ones, that avoid everything and each other.
+
+        Those of arrived robots and of others are zero.
         """
         problem, config = self.problem, self.config
         # Made anew at every step, so that an action depends on the present state alone.

@@ -217,7 +217,9 @@ def _add(values: dict[str, object], name: str, text: str, option: str, what: str
 
 
 def policies_by_label(texts: list[str], option: str = "--policy") -> dict[str, dict[str, object]]:
-    """``policy`` and settings by label: a name is its own, a configuration has what was typed, or what it sets."""
+    """``policy`` and settings by label: a name stands for itself, a configuration for what was typed, or what it sets
+    as label.
+    """
     labelled: list[tuple[str, dict[str, object]]] = []
     for text in texts:
         # The name ends where the first setting begins, for an import path has a colon too.

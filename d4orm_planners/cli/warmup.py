@@ -44,7 +44,10 @@ TEAMS = (*((model, model) for model in COMMON), ("holonomic2d", "differential_dr
 
 
 def warm_up() -> None:
-    """Run everything once on the smallest problems: two robots stand for all teams, as kernels are of models."""
+    """Run everything once on the smallest problems.
+
+    One compilation of a kernel serves every problem with the same models, so two robots stand for all teams.
+    """
     # The last kernel, for three models, takes as long as two others.
     other = in_another_process(f"drive_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_paths(); spread_waves()")
     sample_once((TEAMS[0], TEAMS[-1]))

@@ -38,7 +38,9 @@ SHORTENINGS = 2
 
 
 class DeformedPlan(WorkingPlan):
-    """The team's plan, by default the search's present one, some robots' controls deformed around all others."""
+    """The team's plan, by default that of the search's present candidate, some robots' controls deformed around all
+    others.
+    """
 
     def __init__(self, planner: D4ormD, search: SolveRun, trajectory: Trajectory | None = None) -> None:
         if trajectory is None:
@@ -51,7 +53,10 @@ class DeformedPlan(WorkingPlan):
     def deformed(
         self, robots: Sequence[int], horizon: int, num_samples: int, noise_scale: FloatArray, **scoring: Any
     ) -> tuple[Problem, FloatArray, Trajectory]:
-        """Deform these robots' first ``horizon`` controls around all others: their problem, controls and rollout."""
+        """Deform these robots' first ``horizon`` controls around all others.
+
+        Their problem alone, their new controls as planned, and the rollout of those in it.
+        """
         planner, search, problem = self.planner, self.search, self.problem
         part = problem.select(robots)
         others = np.setdiff1d(np.arange(problem.num_robots), robots)

@@ -195,7 +195,10 @@ def top_k(rewards: ArrayLike, k: int) -> tuple[int, ...]:
 
 
 def k_means(points: ArrayLike, k: int, generator: np.random.Generator) -> IntArray:
-    """``(n,)`` numbers of at most ``k`` clusters of points ``(n, D)``, by Lloyd's rounds from a k-means++ start."""
+    """``(n,)`` the cluster, numbered from 0, of each of points ``(n, D)``, by Lloyd's rounds from a k-means++ start.
+
+    There are fewer than ``k`` where there are fewer different points.
+    """
     positions = np.asarray(points, np.float64)
     centres = positions[[generator.integers(len(positions))]]
     while len(centres) < k:
@@ -216,8 +219,9 @@ def k_means(points: ArrayLike, k: int, generator: np.random.Generator) -> IntArr
 
 
 def diverse(rewards: ArrayLike, points: ArrayLike, k: int, generator: np.random.Generator) -> tuple[int, ...]:
-    """Indices of the best, by ``rewards`` ``(n,)``, of each of at most ``k`` clusters of ``points`` ``(n, ...)``, best
-    first.
+    """Indices of the best of each of at most ``k`` clusters of candidates, best first.
+
+    Of candidates ``points`` ``(n, ...)`` with ``rewards`` ``(n,)``; their distance is the l2 norm of the difference.
     """
     count = np.size(rewards)
     labels = k_means(np.reshape(points, (count, -1)), k, generator)

@@ -144,7 +144,10 @@ class Node:
         return True
 
     def check_number(self) -> None:
-        """Raise ``ValueError`` if another node had this one's number first, or says so, and nothing is solved."""
+        """Raise ``ValueError`` if another node has this one's number, and had it first, or says so.
+
+        A solution is not lost to that.
+        """
         namesake = self.inbox.namesake
         if namesake is not None and namesake <= self._began and not self.search.best.solved:
             last = self._task.num_nodes - 1
@@ -255,7 +258,10 @@ class ThreadJob:
         self._thread = threading.Thread(target=self._run, daemon=True, name=f"d-d4orm-{node.number}")
 
     def start(self) -> None:
-        """Begin; the pool must know of this job before, as Ctrl-C may come while the thread starts."""
+        """Begin.
+
+        Ctrl-C may come while the thread starts, so the pool must know of this job before.
+        """
         self._begin = time.perf_counter()
         self._thread.start()
 

@@ -79,7 +79,10 @@ class NodePool(ABC):
         return self._iteration(best)
 
     def close(self) -> Candidate:
-        """Stop the nodes, wait for threads no longer than the timeout, and return the best candidate seen."""
+        """Stop the nodes, and return the best candidate that they have seen.
+
+        Threads are waited for no longer than the timeout.
+        """
         self._evaluator.stop.set()
         for node in self._nodes:
             node.close()
@@ -102,7 +105,9 @@ class NodePool(ABC):
 
     @abstractmethod
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
-        """New candidates of the nodes, which go on to ``improve`` a solution; time left is below zero when overdue."""
+        """New candidates of the nodes, which go on once there is a solution to ``improve`` it; time left is below 0
+        when overdue.
+        """
 
     def _lose(self, job: ThreadJob, reason: str) -> None:
         self.alive.remove(job.node)

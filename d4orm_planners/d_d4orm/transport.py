@@ -128,8 +128,9 @@ class Transport(Protocol):
         ...
 
     def collect(self, timeout: float = 0.0) -> list[bytes]:
-        """Everything that has arrived since the last call, waited for up to ``timeout`` [s]; nothing, at once, when
-        closed.
+        """Everything that has arrived since the last call; waits up to ``timeout`` [s] for something to arrive.
+
+        Once closed there is nothing, at once.
         """
         ...
 

@@ -109,7 +109,10 @@ def write_figure(folder: Path, name: str, figure: Figure) -> list[Path]:
 
 
 def _grid(count: int, across: int, width: float, height: float) -> tuple[Figure, Sequence[Axes]]:
-    """A figure, not of pyplot, which keeps state, of so many axes of success, so wide, and so high by row [inches]."""
+    """A figure of so many axes of success, so wide, and so high by row [inches].
+
+    Made without pyplot, which keeps state and wants a display.
+    """
     rows = -(-count // across)
     figure: Figure = figures.Figure(figsize=(width, 0.3 + height * rows), layout="constrained")
     axes: list[Axes] = figure.subplots(rows, across, squeeze=False, sharey=True).ravel().tolist()

@@ -32,7 +32,10 @@ act count with all the time of an episode."""
 
 
 def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str:
-    """The page of at least one stored trial, with tables of success within positive ``deadlines`` [s] for planning."""
+    """The page of stored trials, with tables of success within ``deadlines`` [s] for planning, if there are any.
+
+    No trials, or a deadline that is not positive, are a ValueError.
+    """
     if not trials:
         raise ValueError("the store holds no trials yet; run `d4orm evaluate` first")
     groups = _groups(_told_apart(trials))

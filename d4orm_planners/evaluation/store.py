@@ -237,7 +237,10 @@ class TrialStore(SqliteFile):
 
 
 def checked_trial(values: Mapping[str, Any]) -> Trial:
-    """A trial of what a file has for each attribute, truth values as numbers too, else a ValueError about it."""
+    """A trial of what a file has for each of its attributes; truth values may be numbers.
+
+    Another type is a ValueError, which goes on from the trial's name.
+    """
     for name, kinds in _KINDS.items():
         if not isinstance(values[name], kinds) or (name in _JSON and not _is_json(values[name], _JSON[name])):
             raise ValueError(f"has {short_repr(values[name])} as {name}")

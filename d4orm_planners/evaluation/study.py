@@ -59,8 +59,9 @@ class Study:
     observation: Mapping[str, object] = field(default_factory=dict)
 
     def groups(self) -> list[list[Job]]:
-        """A list of jobs per scenario, model, team size and policy, in that order, with one for every seed; all is
-        checked.
+        """A list of jobs per scenario, model, team size and policy, in that order, with one for every seed.
+
+        Raises ValueError and ImportError as :func:`~d4orm_planners.evaluation.evaluate.evaluate`.
         """
         under = tuple(
             replace(condition, physics=self.physics)

@@ -70,7 +70,10 @@ class Compared:
 
 @dataclass(frozen=True, kw_only=True)
 class SuccessRate(Compared):
-    """Rate at which all arrived in time and none was ever in contact, and the time taken, with 95% intervals."""
+    """Rate at which all arrived in time and none was ever in contact, and the time taken.
+
+    Intervals are of 95% confidence.
+    """
 
     #: Trials with whose executed controls :func:`d4orm_env.verify` found no fault; ``None`` where none could be judged
     verified: int | None
@@ -112,7 +115,9 @@ class SuccessWithin:
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float | None, float | None, float | None]:
-    """Mean of a sample and its 95% confidence interval by Student's t; ``None`` for what takes more values."""
+    """Mean of a sample, and its 95% confidence interval by Student's t; ``None`` for what takes more values than there
+    are.
+    """
     if not values:
         return None, None, None
     mean = float(np.mean(values))

@@ -35,8 +35,9 @@ HEADER = ("policy", "noise", "success", "95% interval", "verified", "contact", "
 
 
 def write_results(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
-    """Write ``table.md`` and ``.csv``, and ``trials.csv`` and, with pyarrow, ``.parquet`` of the store there; the
-    paths.
+    """Write ``table.md`` and ``table.csv``, and of the store in the folder ``trials.csv`` and ``trials.parquet``.
+
+    The paths are returned; the last is not among them, and not written, where pyarrow is not installed.
     """
     trials = TrialStore.existing(Path(folder) / STORE).trials()
     paths = [Path(folder, name) for name in ("table.md", "table.csv", "trials.csv", "trials.parquet")]
@@ -61,7 +62,9 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
 
 
 def write_parquet(path: Path, trials: Sequence[Trial]) -> bool:
-    """Write trials as Parquet, one column per attribute; ``False``, without writing, where pyarrow is not installed."""
+    """Write trials as Parquet, one column per attribute; return ``False``, without writing, where pyarrow is not
+    installed.
+    """
     try:
         load(pyarrow)
     except ImportError:

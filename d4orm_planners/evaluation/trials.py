@@ -54,7 +54,9 @@ class Condition:
 
     @property
     def text(self) -> str:
-        """The disturbances that change anything, as JSON: a list of ``[name, attributes]``; else a ValueError."""
+        """The disturbances that change anything, as JSON: a list of ``[name, attributes]``; ValueError for what has no
+        such form.
+        """
         listed = [[name_of(one), _attributes(one)] for one in self.disturbances if not one.negligible]
         return _stored(listed, f"disturbance {self.name!r} has an attribute")
 

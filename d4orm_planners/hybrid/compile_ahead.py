@@ -34,8 +34,9 @@ _RULES = SamplingRules(weights=SoftmaxWeights(1.0))
 
 
 def compile_for_planning(planner: Planner, problem: Problem, announce: Callable[[], None] = lambda: None) -> None:
-    """Compile, after ``announce()``, what a first plan on the CPU needs and the disk lacks, here and in another
-    process.
+    """Compile what a planner's first plan on the CPU needs, in this process and another, unless it is on disk already.
+
+    ``announce`` is called before it begins, if there is anything to do.
     """
     models = problem.team.models
     if not has_to_be_compiled(world_kernels(models).roll_out):

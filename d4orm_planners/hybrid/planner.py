@@ -162,8 +162,9 @@ class Hybrid(Planner):
     def improve_roadmap_solution(
         self, search: SolveRun, solution: RoadmapSolution
     ) -> tuple[RoadmapSolution, Iteration]:
-        """Replan robots on the roadmap, to other paths round, and by turns search among the motions, which cuts
-        corners.
+        """Replan robots on the roadmap, and by turns search among the motions.
+
+        The first finds other paths round, the second cuts corners and leaves out stops.
         """
         if search.best.solved and self.improves_by_lns:
             if search.iteration % LNS_PERIOD == 1:

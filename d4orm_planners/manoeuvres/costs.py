@@ -69,7 +69,9 @@ class Costs(NamedTuple):
 
 
 def costs_of(kind: Kind, area: Area, body: RobotBody, start: Floats, goal: Goal, team_size: int, bent: bool) -> Costs:
-    """Steps to a goal from a start pose ``(6,)``, in a team of so many; ``bent`` if its trailers end in a bend."""
+    """Steps to a goal for a robot that starts at a pose ``(6,)``, in a team of so many; ``bent`` if its trailers end in
+    a bend.
+    """
     modes, cells = primitives_of(kind)[2], np.clip(TEAM_CELLS / team_size, LEAST_CELLS, MOST_CELLS)
     size = np.prod(area.high - area.low) * len(modes) * kind.usual.sectors
     cell = max(area.cell, float(np.sqrt(size / cells)))

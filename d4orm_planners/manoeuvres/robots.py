@@ -113,7 +113,9 @@ def area_of(problem: Problem) -> Area:
 
 
 def distance_kept(problem: Problem, bent: BoolArray) -> float:
-    """Distance that robots keep from everything [m]; less where starts or goals leave less, but for bent trailers."""
+    """Distance that robots keep from everything [m]; less where starts or goals leave less room, but for trailers that
+    are in a bend there.
+    """
     team, usual = problem.team, problem.margin + problem.rounding + CLEARANCE * problem.stride
     goals = _at_goals(problem)
     for robot, model in enumerate(team.robot_models):

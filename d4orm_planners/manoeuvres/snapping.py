@@ -147,7 +147,9 @@ def _leg_controls(leg: Leg, dt: float, first_order: bool) -> Floats:
 
 
 def snap_controls(limits: Limits, snap: Snap) -> FloatArray:
-    """``(n, 2)`` its controls: speed, or acceleration, and turn rate, or its change; or, without heading, x and y."""
+    """``(n, 2)`` its controls: speed, or acceleration, and turn rate, or its change; for robots without a heading along
+    x and y.
+    """
     turn, drive, end, dx, dy = snap
     turns_at_once = limits.turn_acceleration == np.inf
     direction = (dx, dy) if limits.way == SIDEWAYS else (1.0, 0.0)

@@ -141,7 +141,10 @@ class TeamOnRoadmap:
     def after(
         self, here: TeamConfiguration, scratch: PibtWorkspace, seed: int, known: dict[bytes, TeamConfiguration]
     ) -> TeamConfiguration | None:
-        """Take a step, known or new, under the next untried constraint; ``None`` where that cannot be kept."""
+        """Take a step under the next untried constraint; ``None`` where that cannot be kept.
+
+        A configuration that is ``known`` is returned itself; others are added.
+        """
         bodies, constraint = self.bodies, here.next_constraint(self.roadmap)
         forced = np.array(constraint.robots, np.int64), np.array(constraint.nodes, np.int64)
         self.find_paths(here.positions)

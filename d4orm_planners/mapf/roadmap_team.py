@@ -153,8 +153,9 @@ class Replanning:
         minded: BoolArray | None = None,
         release: int = 0,
     ) -> bool:
-        """Plan a robot's path around those that it minds in ``driven``, changed, from step ``release`` on; is there
-        one?
+        """Plan a robot's path around those that it minds in ``driven``, which is changed; return whether it has one.
+
+        It does not set out before step ``release``.
         """
         haste, others = 1 - random.random() * LEISURE, occupancy.around(self.separation(robot, KEEP))
         if minded is not None:
@@ -203,7 +204,9 @@ class Replanning:
             yield found[number], cut
 
     def path(self, reservations: Reservations, robot: int, trip: Trip) -> IntArray:
-        """``(n, 3)`` int64 nodes of a robot's path, and when it sets out for and comes to each; none without one."""
+        """``(n, 3)`` int64 nodes of a robot's path, and when it sets out for and comes to each; none where there is
+        none.
+        """
         roadmap, bodies = self.roadmap, self.bodies
         # Looked for among the sooner ones at first, because that is where it mostly is.
         soon = int(BOUND_FACTOR * self.alone[robot]) + BOUND_EXTRA + trip.release

@@ -238,8 +238,9 @@ class OriginCheck:
 
     @contextmanager
     def installed(self) -> Iterator[None]:
-        """Have the server of web sockets that viser, without an option for it, starts meanwhile ask first; it must
-        start one.
+        """Have a server of web sockets that is started meanwhile ask first; viser starts one and has no option for it.
+
+        Raises RuntimeError if none was started, so that nothing would be checked.
         """
         serve, started = websockets.asyncio.server.serve, False
 

@@ -137,7 +137,10 @@ def _bad_camera_left_alone() -> Iterator[None]:
 
 
 def view_from(limits: Points, dimension: int, aspect: float) -> tuple[Vector, Vector]:
-    """Camera and target for all between corners ``(2, 3)`` beside the controls: from above in the plane, else aside."""
+    """Camera and target for all between corners ``(2, 3)`` to be seen beside the controls in a window of this shape.
+
+    In the plane it is seen from above, in space from the side.
+    """
     size = np.ptp(limits, axis=0).astype(np.float64)
     if dimension == 2:
         back, right, up = np.eye(3)[[2, 0, 1]]

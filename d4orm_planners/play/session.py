@@ -100,8 +100,9 @@ class Session:
 
     @queued()
     def edit(self, edit: Edit, viewport: int = 0) -> None:
-        """Change the scene between two steps, here and for all others; what cannot be is left, and the next message
-        says why.
+        """Change the scene between two steps, as the team of this viewport has it; all others follow.
+
+        What cannot be is left, and the next frame's message says why.
         """
         before = [one.scene for one in self._viewports]
         leader = min(viewport, len(before) - 1)
@@ -252,7 +253,10 @@ class Session:
         options: EpisodeOptions | None = None,
         afresh: bool = False,
     ) -> None:
-        """Go on from scenes, one for each policy, or from here, in new episodes; a failure leaves all as it was."""
+        """Go on from scenes, one for each policy, or from here: episodes of their own, which the policies plan for.
+
+        What fails leaves everything as it was.
+        """
         names, options = names or self.policies, options or self._options
         scenes = [viewport.scene for viewport in self._viewports] if scenes is None else scenes
         recordings = [None] * len(names) if afresh else [viewport.recording for viewport in self._viewports]

@@ -216,8 +216,9 @@ class ViewportView:
     def _follow_hand(
         self, node: Any, kind: str, moved: Moved, modifier: Literal["shift"] | None = None, numbers: Numbers = None
     ) -> None:
-        """Call ``moved(number, position, shift so far, ended)``, numbers perhaps of ``numbers``, while a shape is
-        dragged.
+        """Call ``moved(number, position, shift so far, ended)`` while one of a node's shapes is dragged.
+
+        The number is that of the shape, or what ``numbers`` has for it.
         """
         grips: dict[tuple[int, int], tuple[Points, Points]] = {}
 

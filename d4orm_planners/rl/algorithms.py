@@ -176,7 +176,10 @@ ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType({"ppo": _PPO(), "sac": _S
 
 
 def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: VecNormalize) -> Network:
-    """The deterministic policy of a PPO or SAC model with its normalisation; ``header`` is what these do not tell."""
+    """The deterministic policy of a PPO or SAC model with fully connected layers, and its normalisation.
+
+    ``header`` are fields of :class:`~d4orm_planners.rl.network.Header` that the model does not tell.
+    """
     arrays = {name: parameter.detach().numpy() for name, parameter in _parameters(model).items()}
     arrays["reward_variance"] = normalization.ret_rms.var
     if (sets := _set_extractor(model)) is None:
@@ -195,7 +198,10 @@ def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: V
 
 
 def set_network(model: BaseAlgorithm, normalization: VecNormalize, network: Network) -> None:
-    """Have a model act as a network of its kind does, in its own normalisation; what it thinks of states stays."""
+    """Have a model act as a network does, in its own normalisation; what it thinks of states is left as it is.
+
+    Another kind of network is a ValueError that says which is wanted.
+    """
     arrays, parameters, sets = network.arrays, _parameters(model), _set_extractor(model)
     theirs_kind, mine_kind = network.header.encoder or "flat", "flat" if sets is None else "sets"
     if theirs_kind != mine_kind:

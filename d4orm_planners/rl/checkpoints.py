@@ -129,8 +129,9 @@ class Checkpoints:
     def conclude(
         self, index: int, model: BaseAlgorithm, env: VecNormalize, network: Network, evaluations: Sequence[Evaluation]
     ) -> Checkpoint:
-        """Write the policy, if the last evaluation is as good as any, the curve, and a checkpoint; keep the last
-        :data:`_KEEP`.
+        """Write the policy, if the last of the evaluations is as good as any, the curve, and a stage's checkpoint.
+
+        Older checkpoints are removed but for the last :data:`_KEEP`.
         """
         if evaluations[-1].rank == max(evaluation.rank for evaluation in evaluations):
             network.save(self.policy_path)
@@ -177,7 +178,9 @@ class Checkpoint:
             return cls(folder, evaluations)
 
     def restore(self, env: VecNormalize, model: BaseAlgorithm, fresh: bool) -> None:
-        """Put a new environment, and the model if it is fresh, into the checkpoint's state; else a ValueError."""
+        """Put a new environment, and the model if it is fresh, into the checkpoint's state; ValueError if that cannot
+        be.
+        """
         with _readable(self.folder):
             numbers = self._numbers(model, env, fresh)
         for name, running in _running(env).items():

@@ -124,8 +124,9 @@ class Network:
         return np.tanh(hidden) if self.header.squashed else np.clip(hidden, -1, 1)
 
     def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:
-        """``(N, m)`` most likely controls for observations ``(N, D)``, else a ValueError, of robots with limits ``(N,
-        m)``.
+        """``(N, m)`` most likely controls for ``(N, D)`` observations of robots with limits ``(N, m)``.
+
+        Observations of another size are a ValueError.
         """
         features = self.features_for(observations.shape[1])
         if features is None:
@@ -229,8 +230,9 @@ def _checked(path: Path, header: Header, arrays: dict[str, np.ndarray]) -> dict[
 def _set_shapes(
     features: Features, arrays: Mapping[str, FloatArray]
 ) -> tuple[dict[str, tuple[int | None, ...]], int | None]:
-    """Shapes of the arrays of sets, hidden widths as in ``arrays``, and the width of :func:`encode`'s result, if they
-    say.
+    """Shapes of the arrays of sets, hidden widths being those of ``arrays``, and the width of :func:`encode`'s result.
+
+    The width is ``None`` if the arrays do not say.
     """
     shapes: dict[str, tuple[int | None, ...]] = {}
     width: int | None = features.own_size

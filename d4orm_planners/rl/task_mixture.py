@@ -117,7 +117,9 @@ class TrainTask:
         model: str | None = None,
         **options: Any,
     ) -> RobotVecEnv:
-        """Worlds to train in, each with a ``max_observed``, from this seed on, that choose among ``instances``."""
+        """Worlds to train in, each with a value of ``max_observed``, the first with this seed, and ``instances`` to
+        choose among.
+        """
         if self.disturbances:
             options["disturbances"] = disturbances_at(self.disturbances)
         return RobotVecEnv(

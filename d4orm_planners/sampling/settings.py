@@ -55,7 +55,10 @@ def alpha_bar(num_steps: int, beta_start: float, beta_end: float) -> np.ndarray:
 
 
 def annealed(num_steps: int, beta_start: float, beta_end: float) -> FloatArray:
-    """``(num_steps,)`` deviations ``sqrt(1 / alpha_bar - 1)``, the first step first (paper, Algorithm 1, line 3)."""
+    """``(num_steps,)`` standard deviations ``sqrt(1 / alpha_bar - 1)``, from the first denoising step to the last.
+
+    Paper, Algorithm 1, line 3.
+    """
     return np.sqrt(1 / alpha_bar(num_steps, beta_start, beta_end)[::-1] - 1).astype(np.float32)
 
 

@@ -27,7 +27,9 @@ class SoftmaxWeights:
     cutoff: float = 0.0
 
     def __call__(self, rewards: Array, xp: ModuleType, log_ratio: Array | None = None) -> Array:
-        """Weights of ``rewards`` ``(..., M)``, none at minus infinity, times ``exp(log_ratio)`` where given."""
+        """Weights of ``rewards`` ``(..., M)``, times ``exp(log_ratio)`` where given; a sample at minus infinity gets
+        none.
+        """
         if xp is np:
             return softmax_weights(rewards, self.temperature, self.cutoff, log_ratio)
         usable = rewards > -xp.inf

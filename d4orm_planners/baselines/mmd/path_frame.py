@@ -86,7 +86,9 @@ def world_space(problem: Problem) -> Space:
 
 
 def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> PathFrame | None:
-    """The frame of a robot, ``None`` if it has no path; in space any vector ``turn`` ``(3,)`` chooses its axes."""
+    """The frame of a robot, ``None`` if it has no path to its goal; in space ``turn`` ``(3,)``, any vector, chooses its
+    axes.
+    """
     corners = problem.shortest_paths.path(robot)
     if not len(corners):
         return None
