@@ -18,7 +18,8 @@ from d4orm_env.core.arrays import (
     short_repr,
     whole_number,
 )
-from d4orm_env.core.bodies import body_poses, gaps_at, near_pairs, world_gap
+from d4orm_env.core.bodies import body_poses
+from d4orm_env.core.gaps import gaps_at, near_pairs, world_gap
 from d4orm_env.core.goal_poses import states_at_goals
 from d4orm_env.core.team import Team
 from d4orm_env.core.winding import MAX_ANGLE, MOST_TURNS

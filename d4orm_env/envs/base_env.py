@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.bodies import touching
+from d4orm_env.core.gaps import touching
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem

@@ -84,10 +84,10 @@ class Plan(DisplayMixin):
         history: One record per iteration.
         trajectory: Rollout of the controls.
         metrics: See :func:`d4orm_env.core.trajectory.trajectory_metrics`, which looks for contact at steps, where
-            ``solved`` and ``failures`` know of contact between them too; and ``"denoising_steps"``,
-            ``"denoising_share"``, the share of the iterations that did some, and ``"denoising_time"``, the seconds of
-            ``wall_time`` that these steps took. ``d-d4orm`` adds ``"messages"`` and ``"message_bytes"`` that its nodes
-            sent, each to all others, and ``"waiting_share"``, the share of their time that they waited for each other.
+            ``solved`` and ``failures`` know of contact between them too; and ``"denoising_steps"`` and
+            ``"denoising_share"``, the share of the iterations that did some. ``d-d4orm`` adds ``"messages"`` and
+            ``"message_bytes"`` that its nodes sent, each to all others, and ``"waiting_share"``, the share of their
+            time that they waited for each other.
         provenance: Preset, settings, version and machine; ``None`` for a plan of an older file.
 
     Raises:
@@ -114,6 +114,11 @@ class Plan(DisplayMixin):
             raise ValueError(f"status {self.status!r} is unknown; it must be one of {', '.join(get_args(Status))}")
         if self.solved != {"solved": True, "refuted": False, "infeasible": False}.get(self.status, self.solved):
             raise ValueError(f"status is {self.status!r} and solved is {self.solved}; one of them must be wrong")
+
+    @property
+    def denoising_time(self) -> float | None:
+        """Seconds of ``wall_time`` that denoising took; ``None`` for a plan of an older file."""
+        return self.history[-1].denoising_time if self.history else 0.0
 
     @cached_property
     def verified(self) -> bool:

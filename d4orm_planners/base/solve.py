@@ -261,12 +261,8 @@ class SolveRun:
         )
 
     def _denoising(self) -> dict[str, float]:
-        """Denoising steps done, the share of the iterations that did some, and the seconds that they took."""
+        """Denoising steps done, and the share of the iterations that did some."""
         steps = [record.denoising_steps for record in self.history]
         denoised = np.diff(steps, prepend=0) > 0
         share = denoised.mean() if steps else 0.0
-        return {
-            "denoising_steps": float(self.denoising_steps),
-            "denoising_share": float(share),
-            "denoising_time": self.denoising_time,
-        }
+        return {"denoising_steps": float(self.denoising_steps), "denoising_share": float(share)}

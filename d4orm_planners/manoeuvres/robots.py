@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
-from d4orm_env.core.bodies import nearest, world_gap
+from d4orm_env.core.gaps import nearest, world_gap
 from d4orm_env.core.goal_poses import states_at_goals
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.bodies import gaps_at
+from d4orm_env.core.gaps import gaps_at
 from d4orm_env.core.goal_poses import states_at_goals
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_resolution

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.bodies import nearest
+from d4orm_env.core.gaps import nearest
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory

@@ -17,7 +17,7 @@ from shapely import affinity
 from shapely import geometry as shapely
 
 from d4orm_env import Problem, Team, World, load_problem, make_problem, navigation_v0, rollout, save_problem, verify
-from d4orm_env.core.bodies import pair_gap, world_gap
+from d4orm_env.core.gaps import pair_gap, world_gap
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.footprints import Box, Capsule, Disc, Ellipsoid, Footprint, Polygon
 from d4orm_env.scenarios.settings import parsed

@@ -47,8 +47,7 @@ def assert_same_plan(a: Plan, b: Plan) -> None:
     for name in ("status", "solved", "iterations", "denoising_steps"):
         assert getattr(a, name) == getattr(b, name)
     # Who waits how long for whom is a matter of time, not of the seed.
-    timeless = {"waiting_share": 0, "denoising_time": 0}
-    assert {**a.metrics, **timeless} == {**b.metrics, **timeless}
+    assert {**a.metrics, "waiting_share": 0} == {**b.metrics, "waiting_share": 0}
     assert [record.reward for record in a.history] == [record.reward for record in b.history]
 
 
@@ -87,8 +86,9 @@ def test_solve_returns_a_plan(name: str) -> None:
     denoises = name not in ("ipopt", "mapf", "amswarm", "hybrid")  # hybrid may, or may not
     assert (0 < plan.metrics["denoising_share"] <= 1) == (plan.denoising_steps > 0)
     assert plan.metrics["denoising_share"] == 1 or not denoises
-    assert (plan.metrics["denoising_time"] > 0) == (plan.denoising_steps > 0)
-    assert plan.history[-1].denoising_time == plan.metrics["denoising_time"] < plan.wall_time
+    assert plan.denoising_time is not None
+    assert (plan.denoising_time > 0) == (plan.denoising_steps > 0)
+    assert plan.denoising_time < plan.wall_time
 
 
 @ALL

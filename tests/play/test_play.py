@@ -19,7 +19,7 @@ import pytest
 from network_support import wait_until as until
 
 from d4orm_env import World, make_problem
-from d4orm_env.core.bodies import nearest
+from d4orm_env.core.gaps import nearest
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.disturbances.disturbance_registry import DISTURBANCES
