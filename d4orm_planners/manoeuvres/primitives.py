@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import cache
 from itertools import product
-from math import sqrt
+from math import ceil, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -55,9 +55,8 @@ def primitives_of(kind: Kind) -> tuple[Primitives, Primitives, tuple[Mode, ...]]
     # Longer ones, of a robot that is next to unable to reverse or to turn, have no room in a search.
     kinds = (kind.usual, kind.careful) if kind.finest else (kind,)
     moves = [move for own in kinds for move in MOVES[kind.name](own) if len(move[2]) <= MAX_STEPS]
-    speeds = len(kind.model.speed_indices)
     if kind.stops:
-        moves = [move for move in moves if not any((*move[0][:speeds], *move[1][:speeds]))]
+        moves = [move for move in moves if _stands(kind, move[0]) and _stands(kind, move[1])]
     modes = tuple(dict.fromkeys(mode for before, after, _ in moves for mode in (before, after)))
     modes = tuple(sorted(modes, key=lambda mode: sum(map(abs, mode))))
     driven = [drive(kind, before, controls) for before, _, controls in moves]
@@ -70,8 +69,14 @@ def primitives_of(kind: Kind) -> tuple[Primitives, Primitives, tuple[Mode, ...]]
         for (before, after, controls), (poses, speed) in zip(moves, driven, strict=True)
         if _is_shortest(moves, before, after, controls)
     ]
-    rests = np.array([not any(mode[:speeds]) for mode in modes])
+    rests = np.array([_stands(kind, mode) for mode in modes])
     return table(ahead, rests), table(back, rests), modes
+
+
+def _stands(kind: Kind, mode: Mode) -> bool:
+    """Check whether the robot stays where it is in a mode, so that it can wait."""
+    poses = drive(kind, mode, np.zeros((1, kind.model.control_size), np.float32))[0]
+    return bool((poses[1] == poses[0]).all())
 
 
 def _is_shortest(moves: list[Move], before: Mode, after: Mode, controls: FloatArray) -> bool:
@@ -196,6 +201,13 @@ def _paced(kind: Kind, way: int, speed: float, turn: float) -> Iterator[Move]:
             yield rest, rest, np.concatenate([held(count, push, 0.0), held(count, -push, 0.0)])
 
 
+def _held_turn(kind: Kind, side: int) -> tuple[float, int, int]:
+    """A turn rate, steps of a sector at it, and steps to it, and from it, in which a robot turns by whole sectors."""
+    count = kind.steps(kind.sector, _most(kind, side))
+    rate = kind.sector / (count * kind.dt)
+    return side * rate, count, 2 * count * kind.steps(rate / (2 * count), kind.limits[MAX_TURN_ACCELERATION])
+
+
 def _unicycle2(kind: Kind) -> Iterator[Move]:
     rest = (0.0, 0.0)
     for sectors, side in product(TURNS_ON_THE_SPOT, (1, -1)):
@@ -209,6 +221,17 @@ def _unicycle2(kind: Kind) -> Iterator[Move]:
             least = kind.steps(LENGTHS[0] * kind.cell / 2, speed)
             count, swing = _swing(kind, side, sectors * kind.sector, least)
             yield going, going, np.concatenate([held(count, 0.0, swing), held(count, 0.0, -swing)])
+    for side, speed in product((1, -1), (0.0, kind.pace(1), -kind.pace(-1))):
+        rate, sector, count = _held_turn(kind, side)
+        straight, turning, swing = (speed, 0.0), (speed, rate), rate / (count * kind.dt)
+        yield straight, turning, held(count, 0.0, swing)
+        yield turning, straight, held(count, 0.0, -swing)
+        yield turning, turning, held(sector, 0.0, 0.0)
+        if speed:
+            count = sector * ceil(kind.speeding_up(abs(speed)) / sector)
+            push = speed / (count * kind.dt)
+            yield (0.0, rate), turning, held(count, push, 0.0)
+            yield turning, (0.0, rate), held(count, -push, 0.0)
 
 
 def _car(kind: Kind) -> Iterator[Move]:

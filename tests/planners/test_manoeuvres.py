@@ -126,6 +126,20 @@ def test_primitives_lead_back_where_they_began(model: str) -> None:
         assert np.abs(ends - end).min() < 1e-9
 
 
+def test_a_robot_that_turns_does_not_wait() -> None:
+    moves, _, modes = primitives_of(kind_of("unicycle2"))
+    assert moves.rests.tolist() == [mode == (0.0, 0.0) for mode in modes]
+    assert any(speed == 0 != rate for speed, rate in modes)
+
+
+def test_second_order_unicycles_turn_on_without_stopping() -> None:
+    own = {"max_turn_acceleration": 0.25}
+    team = Team(("unicycle2",), None, 0.5, 0.25, 0.5, own, Box(0.5, 0.25))
+    world = World(boxes=[[1.9, 1.9, 2.1, 2.1]], lower=(0, 0), upper=(5, 5))
+    plan = solved(Problem(team, [[1, 1, 0, 0, 0]], [[3, 1.5]], world, goal_heading=2.5, horizon=600))
+    assert plan.metrics["makespan"] < 16
+
+
 def test_moves_longer_than_a_search_has_room_for_are_left_out() -> None:
     """A robot that reverses by a hair's breadth in a step would take millions of them."""
     usual = kind_of("unicycle1")
