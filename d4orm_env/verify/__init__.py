@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core import portable
-from d4orm_env.dynamics.robot_model import ACCELERATION
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Stretch
 from d4orm_env.verify.curves import CHORD_ERROR
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
@@ -216,7 +215,8 @@ def _braked_away(problem: Problem) -> Floats:
     for robot, model in enumerate(team.robot_models):
         if model.first_order:
             braking[robot] = np.inf
-        elif ACCELERATION in dict(model.state_limits).values():  # it must end too, at a limited rate
+        elif "max_acceleration" in (model.limit_names[column] for _, column in model.state_limits):
+            # It must end too, at a limited rate.
             rate = team.limits[robot, model.control_limits[0]]
             braking[robot] = min(braking[robot], rate * dt * dt / 2 + SPEED_ALLOWANCE * team.max_speed[robot])
     return braking.astype(np.float64)

@@ -24,14 +24,14 @@ CUSP, WHEELS = 0.5, 0.1
 long as each other a robot keeps to one."""
 
 
-class Stretch(NamedTuple):
+class FirstStretch(NamedTuple):
     """The first arc or straight of a curve each."""
 
     side: Floats  #: ``(K,)`` :data:`LEFT`, :data:`STRAIGHT` or :data:`RIGHT`
     length: Floats  #: ``(K,)`` negative backwards; zero if there is nothing to drive
 
 
-def first_stretches(ahead: Floats, left: Floats, turns: Floats, short: Floats, wheels: Floats) -> Stretch:
+def first_stretches(ahead: Floats, left: Floats, turns: Floats, short: Floats, wheels: Floats) -> FirstStretch:
     """First stretches of the shortest curves.
 
     Args:
@@ -51,7 +51,7 @@ def first_stretches(ahead: Floats, left: Floats, turns: Floats, short: Floats, w
         gear, side = np.where(driven, own_gear, gear), np.where(driven, own_side, side)
     best, every = costs.argmin(axis=0), np.arange(len(turns))
     chosen = best, every, first[best, every]
-    return Stretch(sides[chosen], np.where(gears[chosen] != 0, lengths[chosen], 0.0))
+    return FirstStretch(sides[chosen], np.where(gears[chosen] != 0, lengths[chosen], 0.0))
 
 
 def curves(ahead: Floats, left: Floats, turns: Floats, short: Floats) -> tuple[Floats, Floats]:

@@ -475,7 +475,7 @@ def test_the_table_row_by_row(tmp_path: Path) -> None:
         "",
         f"| {' | '.join(HEADER)} |",
         f"|{'---|' * len(HEADER)}",
-        "| go-to-goal | 0.1 | 1 of 2 (50%) | 9% to 91% | - | 1 | 0 | 0 | 5.00 | - | - | - | 0.38 | - | - "
+        "| go-to-goal | 0.1 | 1 of 2 (50%) | 9% to 91% | - | 1 | 0 | 0 | 5.00 | - | - | - | - | 0.38 | - | - "
         "| 0.062 (-0.202 to 0.327) |",
     ]
     paths = write_robustness(tmp_path, rates)

@@ -331,7 +331,9 @@ def test_turned_samples_are_compared_with_others(tmp_path: Path) -> None:
 
 def test_irregular_circles_differ_from_seed_to_seed(tmp_path: Path) -> None:
     rows = made("irregular_circles", tmp_path)
-    assert [(row["team"], row["planner"]) for row in rows] == [("2 robots", name) for name in ("d4orm", "mppi", "cem")]
+    assert [(row["team"], row["planner"]) for row in rows] == [
+        ("2 robots", name) for name in ("d4orm", "mppi", "cem", "d4orm-d")
+    ]
     assert (rows[0]["solved"], rows[0]["steps"], rows[0]["p (steps)"]) == ("1 of 1", "20", "-")
     assert int(rows[2]["steps"]) == 2 * int(rows[2]["restricted"]), "one without a solution counts twice its budget"
     positions = [irregular_circle(seed, 6).start[:, :2] for seed in (0, 0, 1)]
