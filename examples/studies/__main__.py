@@ -34,9 +34,10 @@ FIGURES = (
 )  # fmt: skip
 FURTHER = {
     "algorithm_4": ("coarseness",), "ipopt_preset": ("ipopt",), "big-teams_seconds": ("big-teams",),
+    "amswarm_seconds": ("amswarm",),
 }  # fmt: skip
 """Further trials of these, few: of the paper's presets, and for seconds of one machine."""
-TIMED = ("algorithm_4", "big-teams_seconds", "coarseness", "ipopt")
+TIMED = ("algorithm_4", "amswarm_seconds", "big-teams_seconds", "coarseness", "ipopt")
 """Trials of one machine in one go, whose seconds can be compared."""
 
 
