@@ -63,9 +63,10 @@ class Controller:
     Args:
         policy: Anything that :func:`~d4orm_planners.make_policy` takes.
         mode: ``"nominal"`` or ``"measured"``.
-        reserve: Share of the robots' limits on speed, acceleration and turn rate that the reference leaves to the
-            feedback, in mode ``"nominal"`` or with a tracker. By default 0.5 with a tracker, which has its robot tilt
-            or turn before it can push, 0.2 in mode ``"nominal"`` without, else none.
+        reserve: Share of the robots' limits on speed, acceleration and turn rate, and of what goal headings may be
+            missed by, that the reference leaves to the feedback, in mode ``"nominal"`` or with a tracker. By default
+            0.5 with a tracker, which has its robot tilt or turn before it can push, 0.2 in mode ``"nominal"`` without,
+            else none.
         timeout: Longest time that a step waits for the policy [s], ``None`` for any; robots brake meanwhile, and a late
             answer is not used. A named policy with a ``deadline``, as D4orm-C2F, gets nine tenths of it.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
@@ -162,8 +163,8 @@ class Controller:
         self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
         self.states, _ = completed(problem, self._bounds, states, problem.start, lambda: problem.start)
         start = self._possible(self.states)
-        team = weaker(problem.team, 1 - self.reserve)
-        self._open(problem.with_state(start, problem.goal, team=team), seed)
+        team, tolerance = weaker(problem.team, 1 - self.reserve), problem.goal_heading_tolerance * (1 - self.reserve)
+        self._open(problem.with_state(start, problem.goal, team=team, goal_heading_tolerance=tolerance), seed)
         self.policy.reset(self._env, seed=seed)
         # A tracker follows by itself, and what a policy looks at is as without a lag.
         own = ActuatorLag(self.lag * (not (self.tracker or self._looks)), problem.dt)

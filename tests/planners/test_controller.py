@@ -329,6 +329,23 @@ def test_what_comes_a_little_early_is_of_the_same_period() -> None:
     assert controller.clock_resets == 0
 
 
+class Tolerant(GoToGoal):
+    """Remembers what goal headings may be missed by."""
+
+    def reset(self, env: Any, seed: int = 0) -> None:
+        super().reset(env, seed)
+        self.tolerance = self.problem.goal_heading_tolerance.tolist()
+
+
+def test_the_reference_leaves_a_share_of_what_a_goal_heading_may_be_missed_by() -> None:
+    team = Team(("differential_drive",))
+    problem = Problem(team, [[0, 0, 0, 0]], [[1, 0]], goal_heading=1.0, goal_heading_tolerance=0.1)
+    for mode, tolerance in (("nominal", 0.075), ("measured", 0.1)):
+        controller = Controller(policy := Tolerant(), mode=mode, reserve=0.25 if mode == "nominal" else None)
+        controller.begin(problem, problem.start)
+        assert policy.tolerance == pytest.approx([tolerance])
+
+
 class Slow(GoToGoal):
     """A policy that answers when it is allowed to."""
 
