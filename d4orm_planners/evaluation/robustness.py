@@ -180,10 +180,10 @@ class Tolerance:
 
     @property
     def text(self) -> str:
-        """The level as text: ``"4"``, ``"at least 4"`` where it tolerates the last level, 4, or ``"-"`` for none."""
+        """The level as text: ``"4"``, ``"beyond 4"`` where it tolerates the last level, 4, or ``"-"`` for none."""
         if self.fails is not None:
             return f"{self.fails:g}"
-        return "-" if self.passes is None else f"at least {self.passes:g}"
+        return "-" if self.passes is None else f"beyond {self.passes:g}"
 
 
 _LINE = ("label", "scenario", "num_robots", "model", "control_noise_std", "disturbance")

@@ -180,7 +180,7 @@ def test_the_level_at_which_success_falls_below_90_percent_of_the_undisturbed() 
          group("d", 0, "-" * 10), group("d", 1, "-" * 10), group("e", 0, bad), group("e", 1, "+" * 7 + "-" * 3)]
     )  # fmt: skip
     assert [(one.label, one.passes, one.fails, one.text) for one in tolerances(rates)] == [
-        ("a", 1, 2, "2"), ("b", 1, None, "at least 1"), ("c", 1, None, "at least 1"), ("d", None, None, "-"),
+        ("a", 1, 2, "2"), ("b", 1, None, "beyond 1"), ("c", 1, None, "beyond 1"), ("d", None, None, "-"),
         ("e", 0, 1, "1"),
     ]  # fmt: skip
 
