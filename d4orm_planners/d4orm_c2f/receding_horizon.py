@@ -13,6 +13,7 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.base.planner_registry import find_policy
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.policy_threads import Background
 from d4orm_planners.base.settings import CheckedSettings
@@ -72,6 +73,8 @@ class D4ormC2F(StatePolicy):
 
     def __init__(self, config: D4ormC2FConfig | None = None) -> None:
         self.config = config or D4ormC2FConfig()
+        if self.config.warm_start is not None:
+            find_policy(self.config.warm_start)
         self._engine = get_sampling_engine(self.config.engine)
         self._refinement: Background[CoarsePlan] = Background(yielding=True)
         self._replanning: Background[CoarsePlan] = Background(yielding=True)

@@ -146,6 +146,7 @@ PROBLEM = make_problem("circle", num_robots=2)
         (lambda: episode_plan().export([], "out"), r"format \[\] is unknown; choose one of csv"),
         (lambda: make_planner("mapf").solve(PROBLEM, watcher=3), "watcher is 3; give a function of a DenoisingStep"),
         (lambda: make_planner().solve(PROBLEM, callback=3), "callback is 3; give a function of an IterationRecord"),
+        (lambda: make_policy("d4orm-c2f", warm_start="nope"), "policy 'nope' is unknown"),
         (lambda: episode_plan().plot(3), "axes is 3; give axes of Matplotlib"),
         (lambda: World(circles=[[0, 0]]), r"circles has shape \(1, 2\); expected \(any, 3\): x, y, radius"),
         (lambda: World(boxes=[0, 0, 1]), r"expected \(any, 4\): least x, least y, greatest x, greatest y"),
