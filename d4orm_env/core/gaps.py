@@ -61,11 +61,11 @@ def nearest(problem: Problem, states: FloatArray, enough: float = np.inf) -> flo
     outer = np.linalg.norm(points[:, None] - points, axis=2) - radius[:, None] - radius
     outer[np.tril_indices(len(outer), -1)] = np.inf
     outer[np.diag_indices_from(outer)] = world.clearance(states[:, :d]) - radius
-    gap = gaps_at(team, team.body_poses(states), world)
-    for number in np.argsort(outer, axis=None, kind="stable").tolist():
-        if outer.flat[number] >= min(least, enough):
-            break
-        least = min(least, gap(*divmod(number, len(outer))))
+    first, gap = int(outer.argmin()), gaps_at(team, team.body_poses(states), world)
+    if outer.flat[first] < enough:
+        least = gap(*divmod(first, len(outer)))
+    for one, other in np.argwhere(outer < min(least, enough)).tolist():
+        least = min(least, gap(one, other))
     return least
 
 

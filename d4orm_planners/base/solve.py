@@ -127,8 +127,7 @@ class SolveRun:
         of_controls = partial(evaluate_controls, self.engine, problem, check_interval=self.check_interval)
         self.current = self.best = of_controls(controls)
         self._evaluate = evaluate or of_controls
-        self.iteration = 0
-        self.denoising_steps = 0
+        self.iteration = self.denoising_steps = 0
         self.denoising_time = 0.0
         self.history: list[IterationRecord] = []
         self.state: State = None

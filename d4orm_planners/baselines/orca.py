@@ -96,14 +96,15 @@ class Orca(StatePolicy):
         self._known = options.communication_range, options.line_of_sight
 
     def _controls(self, joint: JointState) -> FloatArray:
-        problem, goals = self.problem, joint.goals
+        problem, aims = self.problem, joint.goals
         if self.config.shortest_paths:
-            goals = goals_along_paths(problem, joint.states[:, : problem.dimension], goals)
-        offsets = goals - joint.states[:, :2]
-        near = np.linalg.norm(offsets, axis=1) < NEARBY * problem.team.turning_radius
-        preferred = np.einsum("ijk,kj->ki", self._turn, preferred_velocities(problem, joint.states, goals))
-        if (by_curves := curving(problem) & near).any():
-            preferred = np.where(by_curves[:, None], velocities_to_goals(problem, joint.states, goals), preferred)
+            aims = goals_along_paths(problem, joint.states[:, : problem.dimension], aims)
+        preferred = np.einsum("ijk,kj->ki", self._turn, preferred_velocities(problem, joint.states, aims))
+        if (by_curves := curving(problem)).any():
+            left, bend = (np.linalg.norm(joint.goals - points, axis=1) for points in (joint.states[:, :2], aims))
+            by_curves &= (left < NEARBY * problem.team.turning_radius) & (bend <= problem.goal_radius)
+            own = velocities_to_goals(problem, joint.states, joint.goals)
+            preferred = np.where(by_curves[:, None], own, preferred)
         return track_velocities(problem, joint.states, self._avoid_known(joint, preferred))
 
     def _avoid_known(self, joint: JointState, preferred: FloatArray) -> FloatArray:

@@ -233,7 +233,7 @@ class _ImitationRun:
 def record_samples(
     env: ParallelEnv, expert: Policy, seed: int, learner: Driver | None = None, *, goal_headings: bool = False
 ) -> Samples:
-    """What the robots of a team of one model saw until they arrived, and what the expert said they should do.
+    """Observations of a team of one model until its robots arrived, and what the expert said they should do.
 
     The expert drives, or a ``learner``, ``(observations (N, D), limits (N, m)) -> controls (N, m)``: then it is asked
     where that has led the team. With ``goal_headings`` the samples and the learner have these, zeros where there are

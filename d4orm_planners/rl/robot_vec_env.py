@@ -171,7 +171,7 @@ class RobotVecEnv(SharedVecEnv):
         return self._masked(observations, [])
 
     def drive(self, controls: FloatArray) -> FloatArray:
-        """What the robots see ``(B * K + E, .)`` after a step with controls ``(B * K, m)`` in physical units, for
+        """Observations ``(B * K + E, .)`` after a step with controls ``(B * K, m)`` in physical units, for
         :meth:`encoded`.
 
         After all others come the ``E`` whose episodes have ended, who saw that last.
