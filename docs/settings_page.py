@@ -1,11 +1,12 @@
-"""The page of settings: what every planner and policy takes, from the docstrings of the code."""
+"""The page of settings: what every planner and policy takes, from the comments on the fields of the code."""
 
 from __future__ import annotations
 
-import inspect
 import re
 from collections.abc import Mapping
 from pathlib import Path
+
+from sphinx.pycode import ModuleAnalyzer
 
 from d4orm_env.core.robot_types import ROBOTS
 from d4orm_env.scenarios import describe_scenario, list_scenarios
@@ -28,15 +29,12 @@ NODES = {"planner": 'What every node refines its candidate with: `"d4orm"`, `"d4
 
 
 def described(config: type) -> dict[str, str]:
-    """Meanings of settings, from the ``Attributes:`` of a configuration class and those it is made of."""
+    """Meanings of settings, from the comments on the fields of a configuration class and those it is made of."""
     meanings: dict[str, str] = {}
-    for kind in reversed(config.__mro__):
-        _, _, listed = (inspect.getdoc(kind) or "").partition("Attributes:\n")
-        listed = listed.split("\n\n")[0]
-        for entry in re.split(r"\n(?=    \w)", "\n" + listed)[1:]:
-            names, _, meaning = entry.strip().partition(": ")
-            if " " in meaning:
-                meanings |= {name.strip(): plain(meaning) for name in names.split(",")}
+    for kind in config.__mro__[-2::-1]:
+        for (owner, name), comment in ModuleAnalyzer.for_module(kind.__module__).find_attr_docs().items():
+            if owner == kind.__name__:
+                meanings[name] = plain(" ".join(comment))
     return meanings
 
 

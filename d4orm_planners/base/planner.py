@@ -27,17 +27,12 @@ State: TypeAlias = Any
 
 @dataclass(frozen=True, kw_only=True)
 class PlannerConfig(CheckedSettings):
-    """Settings that every planner takes.
+    """Settings that every planner takes."""
 
-    Attributes:
-        engine: ``"auto"``, ``"cpu"`` or ``"jax"``.
-        max_iterations: Iterations after which :meth:`Planner.solve` gives up, unless the call says otherwise.
-        improve: Go on improving after the first solution, until the time or iteration budget is used up. By default the
-            first solution ends the search.
-    """
-
-    engine: EngineName = "auto"
-    max_iterations: Count = 50
+    engine: EngineName = "auto"  #: ``"auto"``, ``"cpu"`` or ``"jax"``
+    max_iterations: Count = 50  #: Iterations after which :meth:`Planner.solve` gives up, unless the call says otherwise
+    #: Go on improving after the first solution, until the time or iteration budget is used up. By default the first
+    #: solution ends the search.
     improve: bool = False
 
 

@@ -199,39 +199,27 @@ def _one_step_on(guess: MotionSamples, dt: float) -> MotionSamples:
 
 @dataclass(frozen=True, kw_only=True)
 class AMSwarmConfig(PlannerConfig):
-    """Settings of :class:`AMSwarm`; lengths are in steps of the fastest robot at full speed.
+    """Settings of :class:`AMSwarm`; lengths are in steps of the fastest robot at full speed."""
 
-    Attributes:
-        max_iterations: Runs from start to horizon after which :meth:`Planner.solve` gives up, each with other guesses.
-        lookahead: Steps that a motion is planned for, of which the first is driven.
-        degree: Of the Bernstein polynomials.
-        goal_steps: Steps at the end of a motion that are to be at the goal.
-        goal_weight: Weight of their squared distances from it.
-        smoothness: Weight of the squared jerk.
-        barrier: Share of its distance beyond the safety distance that a robot may use up in a step; 1 allows all of it.
-        lookout: Bodies are avoided that are predicted to come within the safety distance and this; ``None`` is all.
-        clearance: Added to every distance to keep, for what is driven between the steps.
-        perturbation: Largest perturbation of every guess, so that symmetric teams do not block themselves.
-        penalty: First weight of the constraints.
-        growth: Factor by which it grows from one alternation to the next.
-        alternations: Of a replanning, at most.
-        tolerance: Largest violation, and change of a position, at which a replanning ends.
-    """
-
+    #: Runs from start to horizon after which :meth:`Planner.solve` gives up, each with other guesses
     max_iterations: Count = 20
+    #: Steps that a motion is planned for, of which the first is driven
     lookahead: Annotated[Count, Field(ge=2, le=1000)] = 40
-    degree: Annotated[Count, Field(ge=5, le=30)] = 10
-    goal_steps: Count = 32
-    goal_weight: Positive = 1.0
-    smoothness: NotNegative = 1e-4
+    degree: Annotated[Count, Field(ge=5, le=30)] = 10  #: Of the Bernstein polynomials
+    goal_steps: Count = 32  #: Steps at the end of a motion that are to be at the goal
+    goal_weight: Positive = 1.0  #: Weight of their squared distances from it
+    smoothness: NotNegative = 1e-4  #: Weight of the squared jerk
+    #: Share of its distance beyond the safety distance that a robot may use up in a step; 1 allows all of it
     barrier: Share = 0.25
+    #: Bodies are avoided that are predicted to come within the safety distance and this; ``None`` is all
     lookout: NotNegative | None = 10.0
-    clearance: NotNegative = 0.3
+    clearance: NotNegative = 0.3  #: Added to every distance to keep, for what is driven between the steps
+    #: Largest perturbation of every guess, so that symmetric teams do not block themselves
     perturbation: NotNegative = 0.5
-    penalty: Positive = 2.0
-    growth: Annotated[Number, Field(ge=1, le=10)] = 1.05
-    alternations: Steps = 100
-    tolerance: Positive = 0.05
+    penalty: Positive = 2.0  #: First weight of the constraints
+    growth: Annotated[Number, Field(ge=1, le=10)] = 1.05  #: Factor by which it grows from one alternation to the next
+    alternations: Steps = 100  #: Of a replanning, at most
+    tolerance: Positive = 0.05  #: Largest violation, and change of a position, at which a replanning ends
 
 
 class AMSwarm(Planner):

@@ -51,30 +51,23 @@ GRACE = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class IpoptConfig(PlannerConfig):
-    """Settings of :class:`Ipopt`.
+    """Settings of :class:`Ipopt`."""
 
-    Attributes:
-        max_iterations: Perturbed restarts after which :meth:`Planner.solve` gives up.
-        perturbation: Standard deviation of the noise on the warm start's states and controls, in SI units for robots of
-            the default size, and as many times more for larger ones.
-        lookout: Robots are kept clear of what came nearer than this in the last solution, the margin not counted, in
-            steps of the fastest robot at full speed; ``None`` keeps them clear of everything at every step, as in the
-            paper.
-        rounds: Solves per restart. As long as the rollout does not keep the margin, the next one begins where the last
-            one ended; what came near is avoided too, and robots stay where they arrived. The paper solves once.
-        clearance: Added to every distance to keep, for what rounding and tolerances take away, in the same steps.
-        tolerance: IPOPT's, on the scaled optimality error.
-        barrier: IPOPT's first barrier parameter.
-        solver_iterations: IPOPT's own iterations in each solve.
-    """
-
-    max_iterations: Count = 20
+    max_iterations: Count = 20  #: Perturbed restarts after which :meth:`Planner.solve` gives up
+    #: Standard deviation of the noise on the warm start's states and controls, in SI units for robots of the default
+    #: size, and as many times more for larger ones
     perturbation: NotNegative = 0.1
+    #: Robots are kept clear of what came nearer than this in the last solution, the margin not counted, in steps of the
+    #: fastest robot at full speed; ``None`` keeps them clear of everything at every step, as in the paper
     lookout: NotNegative | None = 5.0
+    #: Solves per restart. As long as the rollout does not keep the margin, the next one begins where the last one
+    #: ended; what came near is avoided too, and robots stay where they arrived. The paper solves once.
     rounds: Count = 8
+    #: Added to every distance to keep, for what rounding and tolerances take away, in the same steps
     clearance: NotNegative = 0.02
-    tolerance: Positive = 1e-3
-    barrier: Positive = 1.0
+    tolerance: Positive = 1e-3  #: IPOPT's, on the scaled optimality error
+    barrier: Positive = 1.0  #: IPOPT's first barrier parameter
+    #: IPOPT's own iterations in each solve
     solver_iterations: Annotated[Count, Field(le=2**31 - 1)] = 1000  # IPOPT's own counter
 
 

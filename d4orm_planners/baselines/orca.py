@@ -42,26 +42,21 @@ CORNERS = 16
 
 @dataclass(frozen=True, kw_only=True)
 class OrcaConfig(CheckedSettings):
-    """Settings of :class:`Orca`.
+    """Settings of :class:`Orca`."""
 
-    Attributes:
-        time_horizon: For this long the new velocities keep the robots apart [s].
-        obstacle_time_horizon: The same for obstacles, bounds and arrived robots, which do not give way [s].
-        neighbor_distance: Robots farther away than this are not looked at, in steps of the fastest at full speed.
-        max_neighbors: So many of the nearest robots are looked at.
-        clearance: Added to every robot's radius [m]; by default the problem's margin. Two robots so keep twice that
-            distance, which leaves robots with inertia some room: they cannot take a new velocity at once.
-        shortest_paths: Whether robots prefer to follow their shortest paths among obstacles, or else the straight line.
-        deviation: Standard deviation of the angle by which each robot's preferred velocity is turned, drawn once per
-            episode [rad]. Without it robots in a symmetric formation block each other, as the authors note.
-    """
-
-    time_horizon: Positive = 1.0
+    time_horizon: Positive = 1.0  #: For this long the new velocities keep the robots apart [s]
+    #: The same for obstacles, bounds and arrived robots, which do not give way [s]
     obstacle_time_horizon: Positive = 1.0
+    #: Robots farther away than this are not looked at, in steps of the fastest at full speed
     neighbor_distance: Positive = 100.0
-    max_neighbors: Annotated[Whole, Field(ge=0, le=10**6)] = 10
+    max_neighbors: Annotated[Whole, Field(ge=0, le=10**6)] = 10  #: So many of the nearest robots are looked at
+    #: Added to every robot's radius [m]; by default the problem's margin. Two robots so keep twice that distance, which
+    #: leaves robots with inertia some room: they cannot take a new velocity at once.
     clearance: NotNegative | None = None
+    #: Whether robots prefer to follow their shortest paths among obstacles, or else the straight line
     shortest_paths: bool = True
+    #: Standard deviation of the angle by which each robot's preferred velocity is turned, drawn once per episode [rad].
+    #: Without it robots in a symmetric formation block each other, as the authors note.
     deviation: NotNegative = 0.1
 
 

@@ -47,40 +47,37 @@ class DD4ormConfig(PlannerConfig):
 
     There, ``planner`` says what every node refines its candidate with, ``"d4orm"`` (the default), ``"d4orm-d"`` or
     ``"hybrid"``.
-
-    Attributes:
-        refinement: The settings of that planner. Its ``num_samples`` and ``repair_samples`` are those of all nodes
-            together, of which each gets an equal share; what every planner takes is as it is here.
-        nodes: Number of nodes, at most 1024; ``None`` for one per robot, as where the robots themselves are the nodes.
-        communication_range: Distance of two robots' starts beyond which their nodes do not hear each other [m], where
-            the robots themselves are the nodes; ``None`` for no limit. What a node hears it may pass on, in what it
-            makes of it. Not over a network, which has its own limits.
-        selection: Candidate that a node goes on from: one of the ``k`` candidates of most reward (``"top-k"``), the
-            best one (``"max"``), or one of the best of ``k`` clusters (``"k-means"``).
-        k: Number of candidates that it draws from.
-        mode: ``"sync"``: all nodes refine, then all exchange; the same seed gives the same plan. ``"async"``: each at
-            its own pace; plans then depend on which is sooner.
-        timeout: Seconds that are waited for stragglers: in asynchronous mode in every round, else beyond the time
-            limit of the solve, after which a node is given up.
-        transport: ``"local"``: nodes are threads of this process. ``"ray"``: their iterations run in actors of Ray.
-            ``"zenoh"``: this process is one node among others on a network, each at its own pace (``mode="async"``).
-        address: Of the Ray cluster, ``"host:port"``, or ``"auto"`` for the one that this machine belongs to; ``None``
-            for an instance on this machine that ends with the solve.
-        node: Number of this process among the nodes, from 0; over a network only.
-        zenoh: Network of the nodes: :class:`~d4orm_planners.d_d4orm.zenoh_transport.ZenohSettings`, or a
-            mapping of them; over a network only.
     """
 
+    #: The settings of that planner. Its ``num_samples`` and ``repair_samples`` are those of all nodes together, of
+    #: which each gets an equal share; what every planner takes is as it is here.
     refinement: InstanceOf[DeformationConfig] = field(default_factory=D4ormConfig)
+    #: Number of nodes, at most 1024; ``None`` for one per robot, as where the robots themselves are the nodes
     nodes: Annotated[Count, Field(le=MOST_NODES)] | None = 2
+    #: Distance of two robots' starts beyond which their nodes do not hear each other [m], where the robots themselves
+    #: are the nodes; ``None`` for no limit. What a node hears it may pass on, in what it makes of it. Not over a
+    #: network, which has its own limits.
     communication_range: Positive | None = None
+    #: Candidate that a node goes on from: one of the ``k`` candidates of most reward (``"top-k"``), the best one
+    #: (``"max"``), or one of the best of ``k`` clusters (``"k-means"``)
     selection: Annotated[str, one_of(SELECTIONS)] = "top-k"
-    k: Count = 4
+    k: Count = 4  #: Number of candidates that it draws from
+    #: ``"sync"``: all nodes refine, then all exchange; the same seed gives the same plan. ``"async"``: each at its own
+    #: pace; plans then depend on which is sooner.
     mode: Annotated[str, one_of(MODES)] = "sync"
+    #: Seconds that are waited for stragglers: in asynchronous mode in every round, else beyond the time limit of the
+    #: solve, after which a node is given up
     timeout: Seconds = 1.0
+    #: ``"local"``: nodes are threads of this process. ``"ray"``: their iterations run in actors of Ray. ``"zenoh"``:
+    #: this process is one node among others on a network, each at its own pace (``mode="async"``).
     transport: Annotated[str, one_of(TRANSPORTS)] = "local"
+    #: Number of this process among the nodes, from 0; over a network only
     node: Annotated[Whole, Field(ge=0)] | None = None
+    #: Network of the nodes: :class:`~d4orm_planners.d_d4orm.zenoh_transport.ZenohSettings`, or a mapping of them; over
+    #: a network only
     zenoh: Annotated[ZenohSettings | None, SkipValidation] = None  # checked once it is known to be of use
+    #: Of the Ray cluster, ``"host:port"``, or ``"auto"`` for the one that this machine belongs to; ``None`` for an
+    #: instance on this machine that ends with the solve
     address: str | None = None
 
     def __post_init__(self) -> None:

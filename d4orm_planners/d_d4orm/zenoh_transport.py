@@ -80,26 +80,22 @@ def _endpoints(endpoints: object, least_port: int = 0) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class ZenohSettings(CheckedSettings):
-    """Network of the nodes. By default that is this machine only, and no port is open beyond loopback.
+    """Network of the nodes. By default that is this machine only, and no port is open beyond loopback."""
 
-    Attributes:
-        namespace: Name shared by the nodes of one solve alone: their messages have
-            the key ``NAMESPACE/candidates``.
-        listen: Endpoints to listen at, as ``tcp/192.168.1.10:7447``; port 0 for any free one.
-        connect: Endpoints of other nodes or of a zenoh router; one that is away is tried again and again. One is
-            enough, as connected nodes let each other know of the rest.
-        multicast: Whether to find others by UDP multicast: on the network, or on this machine where the node listens
-            on loopback only.
-        config_file: A zenoh configuration in JSON5, for TLS, access control and whatever else zenoh has; the settings
-            above are not to be in it.
-        grace_period: Seconds that a node with a solution goes on telling it, until all others have one as good.
-    """
-
+    #: Name shared by the nodes of one solve alone: their messages have the key ``NAMESPACE/candidates``
     namespace: Annotated[str, AfterValidator(_namespace)] = "d4orm"
+    #: Endpoints to listen at, as ``tcp/192.168.1.10:7447``; port 0 for any free one
     listen: Annotated[tuple[str, ...], BeforeValidator(_endpoints)] = LOOPBACK
+    #: Endpoints of other nodes or of a zenoh router; one that is away is tried again and again. One is enough, as
+    #: connected nodes let each other know of the rest.
     connect: Annotated[tuple[str, ...], BeforeValidator(partial(_endpoints, least_port=1))] = ()
+    #: Whether to find others by UDP multicast: on the network, or on this machine where the node listens on loopback
+    #: only
     multicast: bool = False
+    #: A zenoh configuration in JSON5, for TLS, access control and whatever else zenoh has; the settings above are not
+    #: to be in it
     config_file: PathText | None = None
+    #: Seconds that a node with a solution goes on telling it, until all others have one as good
     grace_period: Seconds = 2.0
 
     @classmethod

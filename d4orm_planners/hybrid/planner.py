@@ -39,21 +39,17 @@ Improver = Annotated[str, one_of(("lns", "denoising"))]
 
 @dataclass(frozen=True, kw_only=True)
 class HybridConfig(D4ormDConfig):
-    """Settings of the hybrid planner: those of D4orm-D, whose repairs it makes, and of what it does besides.
-
-    Attributes:
-        start: First iteration without initial controls: as in D4orm-D, or ``"mapf"``, path finding on a
-            roadmap, whose solution becomes better from iteration to iteration (:mod:`d4orm_planners.mapf`). ``"auto"``
-            finds paths where obstacles lead somebody far round, or repairs have not helped for some time.
-        reroute: Whether robots that fail search for paths among all others' before they are deformed.
-        improver: Improver of a solution: ``"lns"``, large-neighbourhood search of groups of robots for faster
-            paths around all others, or ``"denoising"``, the whole team deformed again.
-    """
+    """Settings of the hybrid planner: those of D4orm-D, whose repairs it makes, and of what it does besides."""
 
     credit: Credit = "alternate"
     penalty: Positive = 1.0
+    #: First iteration without initial controls: as in D4orm-D, or ``"mapf"``, path finding on a roadmap, whose solution
+    #: becomes better from iteration to iteration (:mod:`d4orm_planners.mapf`). ``"auto"`` finds paths where obstacles
+    #: lead somebody far round, or repairs have not helped for some time.
     start: Start = "auto"
-    reroute: bool = True
+    reroute: bool = True  #: Whether robots that fail search for paths among all others' before they are deformed
+    #: Improver of a solution: ``"lns"``, large-neighbourhood search of groups of robots for faster paths around all
+    #: others, or ``"denoising"``, the whole team deformed again.
     improver: Improver = "lns"
 
 

@@ -82,16 +82,11 @@ class RoadmapPaths:
 
 @dataclass(frozen=True, kw_only=True)
 class MAPFConfig(PlannerConfig):
-    """Settings of path finding.
-
-    Attributes:
-        neighbours: Robots that are replanned together, at most.
-        replannings: Groups of robots that are replanned in an iteration.
-    """
+    """Settings of path finding."""
 
     max_iterations: Count = 1000
-    neighbours: Count = 8
-    replannings: Count = 8
+    neighbours: Count = 8  #: Robots that are replanned together, at most
+    replannings: Count = 8  #: Groups of robots that are replanned in an iteration
 
 
 @dataclass(frozen=True, eq=False)

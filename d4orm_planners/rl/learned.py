@@ -35,24 +35,21 @@ SEEN_OBSTACLES = 4
 class LearnedConfig(CheckedSettings):
     """Settings of a learned policy.
 
-    Attributes:
-        path: A ``.safetensors`` file of ``d4orm train``, or a ``.zip`` that Stable-Baselines3 saved after training on
-            the environment's own observations and actions, each robot's, as through SuperSuit, or the team's, in the
-            joint Gymnasium environment. A zip holds pickled Python, which can
-            run anything when it is loaded: give only one that you made yourself or trust. By default the policy that
-            comes with the package for the robots' model, and for open ground or a world with walls or many obstacles.
-        detours: Whether a robot that has learned to head straight for its goal heads along the shortest path round
-            robots that have arrived where these are in the way. That is a law beside the network, which goes by the
-            joint state; not with a communication range or a line of sight, which hide robots.
-        egocentric: Whether a ``.zip`` was trained in ``egocentric`` environments.
-
     Raises:
         ValueError: If the path ends in something else, or ``egocentric`` comes with one that does not end in ``.zip``.
     """
 
+    #: A ``.safetensors`` file of ``d4orm train``, or a ``.zip`` that Stable-Baselines3 saved after training on the
+    #: environment's own observations and actions, each robot's, as through SuperSuit, or the team's, in the joint
+    #: Gymnasium environment. A zip holds pickled Python, which can run anything when it is loaded: give only one that
+    #: you made yourself or trust. By default the policy that comes with the package for the robots' model, and for open
+    #: ground or a world with walls or many obstacles.
     path: PathText | None = None
+    #: Whether a robot that has learned to head straight for its goal heads along the shortest path round robots that
+    #: have arrived where these are in the way. That is a law beside the network, which goes by the joint state; not
+    #: with a communication range or a line of sight, which hide robots.
     detours: bool = True
-    egocentric: bool = False
+    egocentric: bool = False  #: Whether a ``.zip`` was trained in ``egocentric`` environments
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -27,29 +27,21 @@ AUTHORS_DEFORMATION = {**PAPER_DEFORMATION, "penalty_per_pair": True}
 
 @dataclass(frozen=True, kw_only=True)
 class DeformationConfig(ContinuationSettings, DenoisingConfig):
-    """Settings of planners that deform controls. The defaults are meant for a first solution soon.
-
-    Attributes:
-        num_samples: ``M``.
-        num_steps: ``N``.
-        credit: ``"group"`` by default: each robot's own reward at first, then that of those it is in conflict with.
-            ``"alternate"`` goes on by the team's reward after its first iteration, and every other one.
-        penalty: 2 by default, for the two that touch.
-        clip_between_iterations: True by default: with the default's credit that solves slightly sooner. The paper clips
-            in the rollout only.
-        late_steps: Share of the steps, the last ones, at which the noise is small enough for fewer samples.
-        late_samples: Share of the samples that these steps draw.
-        random_start: Start every deformation from ``U_N ~ N(0, I)``, as Algorithm 1 is written, rather than from zero.
-            The code that the paper's authors published starts from zero, and so does the preset: it solves more.
-    """
+    """Settings of planners that deform controls. The defaults are meant for a first solution soon."""
 
     num_samples: Samples = 256
     num_steps: Steps = 100
+    #: ``"group"`` by default: each robot's own reward at first, then that of those it is in conflict with.
+    #: ``"alternate"`` goes on by the team's reward after its first iteration, and every other one.
     credit: Credit = "group"
-    penalty: Positive = 2.0
+    penalty: Positive = 2.0  #: 2 by default, for the two that touch
+    #: True by default: with the default's credit that solves slightly sooner. The paper clips in the rollout only.
     clip_between_iterations: bool = True
+    #: Share of the steps, the last ones, at which the noise is small enough for fewer samples
     late_steps: ShareOrNone = 0.7
-    late_samples: Share = 0.5
+    late_samples: Share = 0.5  #: Share of the samples that these steps draw
+    #: Start every deformation from ``U_N ~ N(0, I)``, as Algorithm 1 is written, rather than from zero. The code that
+    #: the paper's authors published starts from zero, and so does the preset: it solves more.
     random_start: bool = False
 
 

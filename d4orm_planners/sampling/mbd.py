@@ -28,14 +28,11 @@ class ControlDenoiser(DenoisingPlanner):
 
 @dataclass(frozen=True, kw_only=True)
 class MBDConfig(DenoisingConfig):
-    """Settings of model-based diffusion: one run of many steps.
-
-    Attributes:
-        check_every: Steps of the run that an iteration does, after which its controls are evaluated; ``None`` for all.
-    """
+    """Settings of model-based diffusion: one run of many steps."""
 
     num_steps: Steps = 10_000
     max_iterations: Count = 1
+    #: Steps of the run that an iteration does, after which its controls are evaluated; ``None`` for all
     check_every: Steps | None = None
 
 

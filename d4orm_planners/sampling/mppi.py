@@ -24,16 +24,12 @@ from d4orm_planners.sampling.settings import (
 
 @dataclass(frozen=True, kw_only=True)
 class MPPIConfig(SoftmaxSettings, ContinuationSettings, SamplingConfig):
-    """Settings of MPPI.
+    """Settings of MPPI."""
 
-    Attributes:
-        sigma: Standard deviation of the samples, the same at every step.
-        importance: Share, from 0 to 1, of the importance-sampling term: a sample weighs the less the more it adds to
-            the controls that it was drawn around. In the high dimensions of a team the whole term leaves next to
-            nothing of most samples (the paper calls it unstable and does without).
-    """
-
-    sigma: Positive = 1.0
+    sigma: Positive = 1.0  #: Standard deviation of the samples, the same at every step
+    #: Share, from 0 to 1, of the importance-sampling term: a sample weighs the less the more it adds to the controls
+    #: that it was drawn around. In the high dimensions of a team the whole term leaves next to nothing of most samples
+    #: (the paper calls it unstable and does without).
     importance: ShareOrNone = 0.0
 
 

@@ -83,47 +83,37 @@ PAPER = {
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingConfig(PlannerConfig):
-    """Settings of every sampling planner.
+    """Settings of every sampling planner."""
 
-    Attributes:
-        num_samples: ``M``, trajectories per step.
-        num_steps: ``N``, steps per iteration.
-        credit: ``"team"`` weights samples by the team's mean reward, as in the paper; ``"robot"`` weights each robot's
-            part of a sample by the robot's own reward, which keeps the signal from diluting with the number of robots;
-            ``"alternate"`` does the second in the first iteration, the first in the next, and so on; ``"group"``
-            weights by the reward of those that a robot was in conflict with, directly or by others, in the last plan.
-        penalty: Factor of the problem's collision penalty, 1 in the paper. A robot's own reward leaves out what contact
-            costs the other, so that driving through can be cheaper than yielding; 2 makes up for that.
-        penalty_per_pair: Whether it is taken for every robot that a robot is too close to, as in the authors' published
-            code, rather than once, as in the paper. All obstacles together count once.
-        short_paths: Whether robots whose paths are all short next to their size are sampled over the steps that evading
-            each other takes, by rewards that make up for the shortness
-            (:func:`d4orm_planners.sampling.loop.on_short_paths`). The paper always samples all steps.
-        final_approach: Whether robots that must slow down to dock
-            (:attr:`~d4orm_env.core.problem.Problem.goal_speed`) turn straight to their goals after an iteration, and
-            brake there, where that makes nothing worse. Samples hardly ever stop anywhere. The paper's robots need not.
-    """
-
-    num_samples: Samples = 1024
-    num_steps: Steps = 100
+    num_samples: Samples = 1024  #: ``M``, trajectories per step
+    num_steps: Steps = 100  #: ``N``, steps per iteration
+    #: ``"team"`` weights samples by the team's mean reward, as in the paper; ``"robot"`` weights each robot's part of a
+    #: sample by the robot's own reward, which keeps the signal from diluting with the number of robots; ``"alternate"``
+    #: does the second in the first iteration, the first in the next, and so on; ``"group"`` weights by the reward of
+    #: those that a robot was in conflict with, directly or by others, in the last plan
     credit: Credit = "team"
+    #: Factor of the problem's collision penalty, 1 in the paper. A robot's own reward leaves out what contact costs the
+    #: other, so that driving through can be cheaper than yielding; 2 makes up for that.
     penalty: Positive = 1.0
+    #: Whether it is taken for every robot that a robot is too close to, as in the authors' published code, rather than
+    #: once, as in the paper. All obstacles together count once.
     penalty_per_pair: bool = False
+    #: Whether robots whose paths are all short next to their size are sampled over the steps that evading each other
+    #: takes, by rewards that make up for the shortness (:func:`d4orm_planners.sampling.loop.on_short_paths`). The paper
+    #: always samples all steps.
     short_paths: bool = True
+    #: Whether robots that must slow down to dock (:attr:`~d4orm_env.core.problem.Problem.goal_speed`) turn straight to
+    #: their goals after an iteration, and brake there, where that makes nothing worse. Samples hardly ever stop
+    #: anywhere. The paper's robots need not.
     final_approach: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
 class SoftmaxSettings(CheckedSettings):
-    """Settings of methods that weight samples by a softmax.
+    """Settings of methods that weight samples by a softmax."""
 
-    Attributes:
-        temperature: ``lambda`` of the softmax over normalised rewards.
-        weight_cutoff: Softmax weights below this share of the largest count as zero.
-    """
-
-    temperature: Positive = 0.3
-    weight_cutoff: Cutoff = 1e-3
+    temperature: Positive = 0.3  #: ``lambda`` of the softmax over normalised rewards
+    weight_cutoff: Cutoff = 1e-3  #: Softmax weights below this share of the largest count as zero
 
     @property
     def weights(self) -> SoftmaxWeights:
@@ -135,16 +125,12 @@ class SoftmaxSettings(CheckedSettings):
 class DiffusionSettings(CheckedSettings):
     """Settings of methods whose noise follows the diffusion schedule.
 
-    Attributes:
-        beta_start: First variance of the diffusion schedule.
-        beta_end: Last variance of the diffusion schedule.
-
     Raises:
         ValueError: If the first is above the last.
     """
 
-    beta_start: Variance = 1e-4
-    beta_end: Variance = 2e-2
+    beta_start: Variance = 1e-4  #: First variance of the diffusion schedule
+    beta_end: Variance = 2e-2  #: Last variance of the diffusion schedule
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -160,13 +146,10 @@ class DiffusionSettings(CheckedSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ContinuationSettings(CheckedSettings):
-    """Settings of methods whose iterations go on from the last one's controls.
+    """Settings of methods whose iterations go on from the last one's controls."""
 
-    Attributes:
-        clip_between_iterations: Start the next iteration from the controls as executed, inside the limits, rather than
-            as the last one left them. Either way they are zero after arrival.
-    """
-
+    #: Start the next iteration from the controls as executed, inside the limits, rather than as the last one left them.
+    #: Either way they are zero after arrival.
     clip_between_iterations: bool = False
 
     def continued(self, candidate: Candidate) -> FloatArray:

@@ -43,38 +43,26 @@ Stretch = Annotated[Number, Field(ge=1, le=100)]
 
 @dataclass(frozen=True, kw_only=True)
 class MMDConfig(PlannerConfig):
-    """Settings of :class:`MMD`.
+    """Settings of :class:`MMD`."""
 
-    Attributes:
-        max_iterations: Nodes of the constraint tree that are expanded before :meth:`Planner.solve` gives up.
-        num_samples: Motions of a robot that are denoised together.
-        num_steps: Denoising steps from noise.
-        guide_from: Share of the denoising steps, the last ones, that are guided.
-        guide_steps: Of guidance per denoising step.
-        noise_scale: Of the noise between denoising steps; 1 is DDPM's.
-        reuse_steps: Denoising steps when a robot plans again, from its motions with as much noise as that many steps
-            take away (MMD-xECBS); ``None`` begins with noise (MMD-ECBS).
-        soft_pull: Share of a violation of soft constraints, which are the other robots' paths, that a step of guidance
-            takes away; 0 leaves them out (MMD-CBS).
-        constraint_radius: Of constraints, as a multiple of the distance that two robots keep.
-        clearance: Distance from obstacles beyond radius and margin that guidance leads to, in steps of the fastest
-            robot at full speed.
-        quickest: Times the shortest time of its path that a motion takes at least.
-        slowest: And at most; between the two it is drawn.
-    """
-
-    max_iterations: Count = 300
-    num_samples: Samples = 32
-    num_steps: Steps = 25
-    guide_from: ShareOrNone = 0.5
-    guide_steps: Annotated[Count, Field(le=1000)] = 4
-    noise_scale: NotNegative = 0.5
+    max_iterations: Count = 300  #: Nodes of the constraint tree that are expanded before :meth:`Planner.solve` gives up
+    num_samples: Samples = 32  #: Motions of a robot that are denoised together
+    num_steps: Steps = 25  #: Denoising steps from noise
+    guide_from: ShareOrNone = 0.5  #: Share of the denoising steps, the last ones, that are guided
+    guide_steps: Annotated[Count, Field(le=1000)] = 4  #: Of guidance per denoising step
+    noise_scale: NotNegative = 0.5  #: Of the noise between denoising steps; 1 is DDPM's
+    #: Denoising steps when a robot plans again, from its motions with as much noise as that many steps take away
+    #: (MMD-xECBS); ``None`` begins with noise (MMD-ECBS)
     reuse_steps: Count | None = 3
+    #: Share of a violation of soft constraints, which are the other robots' paths, that a step of guidance takes away;
+    #: 0 leaves them out (MMD-CBS)
     soft_pull: ShareOrNone = 0.5
-    constraint_radius: Stretch = 1.2
+    constraint_radius: Stretch = 1.2  #: Of constraints, as a multiple of the distance that two robots keep
+    #: Distance from obstacles beyond radius and margin that guidance leads to, in steps of the fastest robot at full
+    #: speed
     clearance: NotNegative = 0.3
-    quickest: Stretch = 1.1
-    slowest: Stretch = 3.0
+    quickest: Stretch = 1.1  #: Times the shortest time of its path that a motion takes at least
+    slowest: Stretch = 3.0  #: And at most; between the two it is drawn
 
     def __post_init__(self) -> None:
         super().__post_init__()
