@@ -22,25 +22,15 @@ else:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory:
-    """The motion of a team. Index 0 along time is the start, index ``t`` the state after ``t`` steps.
+    """The motion of a team. Index 0 along time is the start, index ``t`` the state after ``t`` steps."""
 
-    Attributes:
-        states: ``(H+1, K, n)`` states, padded with zeros.
-        positions: ``(H+1, K, d)`` positions [m].
-        controls: ``(H, K, m)`` controls as executed: within the limits, zero once docked.
-        rewards: ``(H, K)`` reward of each robot at each step.
-        arrived: ``(H+1, K)`` whether the robot has docked at its goal.
-        collided: ``(H+1, K)`` hard contact with a robot, an obstacle or the bounds.
-        margin_violated: ``(H+1, K)`` the same with the safety margin added.
-    """
-
-    states: FloatArray
-    positions: FloatArray
-    controls: FloatArray
-    rewards: FloatArray
-    arrived: BoolArray
-    collided: BoolArray
-    margin_violated: BoolArray
+    states: FloatArray  #: ``(H+1, K, n)`` states, padded with zeros
+    positions: FloatArray  #: ``(H+1, K, d)`` positions [m]
+    controls: FloatArray  #: ``(H, K, m)`` controls as executed: within the limits, zero once docked
+    rewards: FloatArray  #: ``(H, K)`` reward of each robot at each step
+    arrived: BoolArray  #: ``(H+1, K)`` whether the robot has docked at its goal
+    collided: BoolArray  #: ``(H+1, K)`` hard contact with a robot, an obstacle or the bounds
+    margin_violated: BoolArray  #: ``(H+1, K)`` the same with the safety margin added
 
     @property
     def key_figures(self) -> list[KeyFigure]:

@@ -51,28 +51,17 @@ class Setpoints:
 
     Velocity, acceleration and jerk are the exact derivatives of one spline of class C4, which keeps the limits that it
     was made for and was verified to touch nothing, between the samples too.
-
-    Attributes:
-        time: ``(T,)`` from 0 until all robots are at rest [s].
-        position: ``(T, K, d)`` [m].
-        velocity: ``(T, K, d)`` [m/s].
-        acceleration: ``(T, K, d)`` [m/s^2].
-        jerk: ``(T, K, d)`` [m/s^3].
-        heading: ``(T, K)`` [rad], not wrapped; zero for robots whose model has none.
-        stretch: Times the plan's duration that the motion takes, at least 1.
-        deviation: Largest distance from the plan at its steps [m].
-        report: What the verification found: least separation and clearance.
     """
 
-    time: Floats
-    position: Floats
-    velocity: Floats
-    acceleration: Floats
-    jerk: Floats
-    heading: Floats
-    stretch: float
-    deviation: float
-    report: VerificationReport
+    time: Floats  #: ``(T,)`` from 0 until all robots are at rest [s]
+    position: Floats  #: ``(T, K, d)`` [m]
+    velocity: Floats  #: ``(T, K, d)`` [m/s]
+    acceleration: Floats  #: ``(T, K, d)`` [m/s^2]
+    jerk: Floats  #: ``(T, K, d)`` [m/s^3]
+    heading: Floats  #: ``(T, K)`` [rad], not wrapped; zero for robots whose model has none
+    stretch: float  #: Times the plan's duration that the motion takes, at least 1
+    deviation: float  #: Largest distance from the plan at its steps [m]
+    report: VerificationReport  #: What the verification found: least separation and clearance
 
     def to_dataframe(self) -> pd.DataFrame:
         """A row for each time and robot: ``time``, ``robot``, ``x`` to ``jz`` (``jy`` in the plane), ``heading``.
@@ -169,30 +158,19 @@ def _coefficients(motion: SmoothMotion, curves: PPoly, height: float) -> Floats:
 
 @dataclass(frozen=True)
 class ExportReport:
-    """Files that were written, and the figures of the motion in them.
+    """Files that were written, and the figures of the motion in them."""
 
-    Attributes:
-        files: Their paths.
-        duration: Of the motion [s].
-        stretch: Times the plan's duration that it takes.
-        deviation: Largest distance from the plan at its steps [m].
-        min_separation: Least gap between two robots [m].
-        min_clearance: Least gap to an obstacle or bound [m].
-        min_overhead: Least height of a robot above another that it flies over, within both radii and the margin in the
-            plane [m]; infinite where none does, or the team moves in the plane.
-        heights: Lowest and highest z of any robot [m].
-        pieces: Polynomials a robot, or ``None``.
-    """
-
-    files: tuple[Path, ...]
-    duration: float
-    stretch: float
-    deviation: float
-    min_separation: float
-    min_clearance: float
+    files: tuple[Path, ...]  #: Their paths
+    duration: float  #: Of the motion [s]
+    stretch: float  #: Times the plan's duration that it takes
+    deviation: float  #: Largest distance from the plan at its steps [m]
+    min_separation: float  #: Least gap between two robots [m]
+    min_clearance: float  #: Least gap to an obstacle or bound [m]
+    #: Least height of a robot above another that it flies over, within both radii and the margin in the plane [m];
+    #: infinite where none does, or the team moves in the plane
     min_overhead: float
-    heights: tuple[float, float]
-    pieces: int | None = None
+    heights: tuple[float, float]  #: Lowest and highest z of any robot [m]
+    pieces: int | None = None  #: Polynomials a robot, or ``None``
 
     @property
     def num_bytes(self) -> int | None:
