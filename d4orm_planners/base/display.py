@@ -5,13 +5,14 @@ Names of scenarios and policies, error messages and all else in a store of trial
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.summary_line import KeyFigure, joined
-from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.core.summary_line import KeyFigure, joined, outcome_rows
+from d4orm_env.core.trajectory import Trajectory, mean_stretch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,29 +29,37 @@ _MARKDOWN = "\\`*{}[]<>|~&"
 _FORMULA = "=+-@"
 
 
-class _HasMotion(Protocol):
-    @property
-    def problem(self) -> Problem: ...
-    @property
-    def trajectory(self) -> Trajectory: ...
-    @property
-    def title(self) -> str: ...
-    @property
-    def key_figures(self) -> list[KeyFigure]: ...
-    def motion(self, title: str | None = None, denoising: Denoising | None = None) -> ReplayMotion: ...
-    def animate(self) -> Replay: ...
-
-
 class DisplayMixin:
-    """A motion of a team in a world, with a title and key figures. What draws is imported when it is asked for."""
+    """A motion of a team in a world, with a title and metrics. What draws is imported when it is asked for."""
 
-    def __repr__(self: _HasMotion) -> str:
+    problem: Problem
+    trajectory: Trajectory
+    metrics: dict[str, float]
+
+    @property
+    def title(self) -> str:
+        """What it is, in a few words."""
+        raise NotImplementedError
+
+    @property
+    def key_figures(self) -> list[KeyFigure]:
+        """Key figures of the team."""
+        return outcome_rows(self.metrics, self.problem.num_robots)
+
+    @cached_property
+    def stretch(self) -> float:
+        """Path travelled over the shortest path, see :func:`d4orm_env.core.trajectory.mean_stretch`; found when it is
+        first asked for. In lifelong mode, where goals change, it means nothing.
+        """
+        return mean_stretch(self.problem, self.trajectory)
+
+    def __repr__(self) -> str:
         return f"{type(self).__name__}: {self.title}\n  {joined(self.key_figures)}"
 
-    def _repr_html_(self: _HasMotion) -> str:
+    def _repr_html_(self) -> str:
         return pictures.motion_html(self.problem, self.trajectory, self.title, self.key_figures)
 
-    def plot(self: _HasMotion, axes: Axes | None = None) -> Axes:
+    def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the motion with matplotlib; see :func:`d4orm_env.render.pictures.plot`.
 
         Args:
@@ -64,7 +73,7 @@ class DisplayMixin:
         """
         return pictures.plot(self.problem, self.trajectory, axes)
 
-    def motion(self: _HasMotion, title: str | None = None, denoising: Denoising | None = None) -> ReplayMotion:
+    def motion(self, title: str | None = None, denoising: Denoising | None = None) -> ReplayMotion:
         """Return the motion of a replay; :class:`d4orm_env.render.replay.Replay` puts several side by side.
 
         Args:
@@ -79,11 +88,11 @@ class DisplayMixin:
             self.problem, self.trajectory, title, figures, goals=goals, denoising=denoising, bodies=bodies
         )
 
-    def animate(self: _HasMotion) -> Replay:
+    def animate(self) -> Replay:
         """A replay that notebooks show where it is the last value of a cell."""
         return replay.Replay(self.title, (self.motion(),))
 
-    def to_html(self: _HasMotion, path: str | Path) -> Path:
+    def to_html(self, path: str | Path) -> Path:
         """Write a replay to play, pause and scrub in any browser: one file that loads nothing from a network.
 
         Args:

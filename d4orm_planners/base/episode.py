@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import gymnasium
@@ -14,8 +13,8 @@ from pettingzoo import ParallelEnv
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray, short_repr, whole_number
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.summary_line import KeyFigure, count, outcome_rows
-from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory, accelerations, mean_squared_jerk, mean_stretch
+from d4orm_env.core.summary_line import count
+from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory, accelerations, mean_squared_jerk
 from d4orm_env.disturbances.disturbance import events_of
 from d4orm_env.envs.joint_env import JointNavigationEnv
 from d4orm_env.envs.joint_state import JointState, split_state
@@ -47,25 +46,12 @@ class Episode(DisplayMixin):
         return f"{self.problem.name}, {count(self.problem.num_robots, 'robot')}, {seconds:.1f} s"
 
     @property
-    def key_figures(self) -> list[KeyFigure]:
-        """Return the team's key figures."""
-        return outcome_rows(self.metrics, self.problem.num_robots)
-
-    @property
     def controls(self) -> FloatArray:
         """``(H, K, m)`` executed controls within the horizon, then zeros: a planner's ``initial_controls``."""
         executed = self.trajectory.controls[: self.problem.horizon]
         controls = np.zeros((self.problem.horizon, *executed.shape[1:]), np.float32)
         controls[: len(executed)] = executed
         return controls
-
-    @cached_property
-    def stretch(self) -> float:
-        """Path travelled over the shortest path, see :func:`d4orm_env.core.trajectory.mean_stretch`.
-
-        In lifelong mode, where goals change, it means nothing.
-        """
-        return mean_stretch(self.problem, self.trajectory)
 
 
 def open_env(problem: Problem, physics: str = "model", policy: Policy | None = None, **options: Any) -> ParallelEnv:

@@ -14,8 +14,8 @@ from d4orm_env.core.files import checked_path, replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.summary_line import KeyFigure, count, outcome_rows
-from d4orm_env.core.trajectory import Trajectory, mean_stretch
+from d4orm_env.core.summary_line import count
+from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.verify import VerificationReport, verify
 from d4orm_planners.base.candidate import step_faults
 from d4orm_planners.base.display import DisplayMixin
@@ -129,13 +129,6 @@ class Plan(DisplayMixin):
     def _report(self) -> VerificationReport:
         return verify(self.problem, self.controls)
 
-    @cached_property
-    def stretch(self) -> float:
-        """Path travelled over the shortest path, see :func:`d4orm_env.core.trajectory.mean_stretch`; found when it is
-        first asked for, so that solving does not wait for it.
-        """
-        return mean_stretch(self.problem, self.trajectory)
-
     @property
     def failures(self) -> dict[str, str]:
         """The robots that the plan leaves unsolved, and why: a sentence for each, by agent name; empty if it is solved.
@@ -217,11 +210,6 @@ class Plan(DisplayMixin):
         spent = f"{count(self.iterations, 'iteration')}, {self.wall_time:.2f} s"
         team = f"{self.problem.name}, {count(self.problem.num_robots, 'robot')}"
         return f"{team} by {self.planner}: {self.status.replace('_', ' ')} after {spent}"
-
-    @property
-    def key_figures(self) -> list[KeyFigure]:
-        """Return the plan's key figures."""
-        return outcome_rows(self.metrics, self.problem.num_robots)
 
     def to_dynobench(self, path: str | os.PathLike[str]) -> None:
         """Write the motion as a result file of dynobench and db-CBS: states and actions of every robot.
