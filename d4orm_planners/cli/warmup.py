@@ -25,16 +25,7 @@ from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.cli.options import Quiet
 from d4orm_planners.d4orm_c2f.barrier import safe_velocities
 from d4orm_planners.engine.score import score_kernel
-from d4orm_planners.hybrid.compile_ahead import (
-    drive_once,
-    find_paths,
-    in_another_process,
-    no_controls,
-    roll_out_once,
-    sample_once,
-    smallest_problem,
-    spread_waves,
-)
+from d4orm_planners.hybrid import compile_ahead
 from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.sampling.loop import SamplingPlanner
 from d4orm_planners.tracking.tracker import follow_reference, reference_kernel, straight_kernel
@@ -49,26 +40,28 @@ def warm_up() -> None:
     One compilation of a kernel serves every problem with the same models, so two robots stand for all teams.
     """
     # The last kernel, for three models, takes as long as two others.
-    other = in_another_process(f"drive_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_paths(); spread_waves()")
-    sample_once((TEAMS[0], TEAMS[-1]))
+    other = compile_ahead.in_another_process(
+        f"drive_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_paths(); spread_waves()"
+    )
+    compile_ahead.sample_once((TEAMS[0], TEAMS[-1]))
     for models in TEAMS:
-        roll_out_once(models)
+        compile_ahead.roll_out_once(models)
     for models in TEAMS[1:]:
-        drive_once(models)
+        compile_ahead.drive_once(models)
     for models in TEAMS[:-1]:
         _brake(models)
     _step_environments()
     other.wait()
-    sample_once(TEAMS)
-    drive_once(TEAMS[0])
-    find_paths()
-    spread_waves()
+    compile_ahead.sample_once(TEAMS)
+    compile_ahead.drive_once(TEAMS[0])
+    compile_ahead.find_paths()
+    compile_ahead.spread_waves()
     _evade()
     _plan()
 
 
 def _plan() -> None:
-    problem = smallest_problem(TEAMS[0])
+    problem = compile_ahead.smallest_problem(TEAMS[0])
     # A planner that does not sample has nothing to compile that the others have not.
     for name in (name for name in PLANNERS.own() if issubclass(PLANNERS[name], SamplingPlanner)):
         make_planner(name, engine="cpu", num_samples=32, num_steps=1).solve(problem, max_iterations=1)
@@ -76,23 +69,23 @@ def _plan() -> None:
 
 def _brake(models: tuple[str, ...]) -> None:
     """Bring robots to rest, as D4orm-C2F does after its plans."""
-    problem = smallest_problem(models)
+    problem = compile_ahead.smallest_problem(models)
     at_rest = np.zeros((1, *problem.goal.shape), np.float32)
     follow_reference(problem, problem.start, at_rest, at_rest, 0.0)
 
 
 def _evade() -> None:
     """Keep two robots apart, as D4orm-C2F does in the last resort."""
-    problem = smallest_problem(TEAMS[0])
+    problem = compile_ahead.smallest_problem(TEAMS[0])
     colliding, acting = 10 * (problem.start[::-1] - problem.start)[:, :2], np.ones(problem.num_robots, np.bool_)
-    joint = JointState(problem.start, problem.goal, no_controls(problem)[0], ~acting, 0)
+    joint = JointState(problem.start, problem.goal, compile_ahead.no_controls(problem)[0], ~acting, 0)
     safe_velocities(problem, joint, colliding, acting, problem.margin)
 
 
 def _step_environments() -> None:
     disturbances = [Dropout(0.5), StateNoise(0.1), Intruder()]
     for arguments in ({}, {"lifelong": True}, {"disturbances": disturbances, "observed_rays": 4}):
-        env = navigation_v0.parallel_env(problem=smallest_problem(TEAMS[0]), **arguments)
+        env = navigation_v0.parallel_env(problem=compile_ahead.smallest_problem(TEAMS[0]), **arguments)
         env.reset(seed=0)
         zero = np.zeros(env.action_space(env.possible_agents[0]).shape, np.float32)
         env.step(dict.fromkeys(env.agents, zero))

@@ -21,32 +21,8 @@ from d4orm_planners import reference as plain
 from d4orm_planners.base.controller import Mode
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.engine.sampling_types import SamplingTask, get_sampling_engine
-from d4orm_planners.evaluation.env_steps import (
-    DISTURBANCES,
-    RAY_BOXES,
-    RAYS,
-    RECTANGLE,
-    RIGID,
-    measure_env,
-    measure_functional,
-    measure_rigid,
-    measure_rooms,
-    measure_worlds,
-)
+from d4orm_planners.evaluation import env_steps, probes
 from d4orm_planners.evaluation.measuring import BenchmarkSettings, Measurement, Spread, in_turn, measure
-from d4orm_planners.evaluation.probes import (
-    BOXES,
-    DEADLINE,
-    Where,
-    boxed_problem,
-    measure_big_loops,
-    measure_big_team,
-    measure_improvement,
-    measure_index,
-    measure_memory,
-    measure_robots,
-    measure_startup,
-)
 from d4orm_planners.sampling.d4orm import D4orm
 
 PRESETS = (None, "paper")
@@ -94,19 +70,19 @@ def _parts(settings: BenchmarkSettings) -> Iterator[Part]:
             work = partial(_measure_threads, settings, num_robots, threads)
             yield "threads", f"{num_robots} robots on {threads} threads", work
     yield from _environment_parts(settings)
-    surroundings: dict[Where, tuple[int, ...]] = {"near": settings.obstacles, "far": settings.far_obstacles}
+    surroundings: dict[probes.Where, tuple[int, ...]] = {"near": settings.obstacles, "far": settings.far_obstacles}
     for where, counts in surroundings.items():
         for count in counts:
             yield "obstacles", f"{count} boxes {where}", partial(_measure_obstacles, settings, count, where)
     for cells in settings.map_cells:
-        yield "index", f"index of {cells} x {cells} cells", partial(measure_index, cells)
+        yield "index", f"index of {cells} x {cells} cells", partial(probes.measure_index, cells)
     for model, mode in CONTROL_LOOPS:
-        yield "robots", f"control loops of {model}, {mode}", partial(measure_robots, settings, model, mode)
+        yield "robots", f"control loops of {model}, {mode}", partial(probes.measure_robots, settings, model, mode)
     for scenario, size in (("circle", 8), ("warehouse", 16)):
-        start = partial(measure_startup, scenario, size, min(settings.repetitions, 5))
+        start = partial(probes.measure_startup, scenario, size, min(settings.repetitions, 5))
         yield "startup", f"first plan of a process, {scenario}", start
     for size in (settings.memory_robots,) if find_spec("resource") else ():  # Windows has none
-        memory = partial(measure_memory, size, settings.num_samples, settings.horizon, diameter(size))
+        memory = partial(probes.measure_memory, size, settings.num_samples, settings.horizon, diameter(size))
         yield "memory", f"memory of {size} robots", memory
     for engine in sorted(fast.intersection(settings.engines)):
         for preset in PRESETS:
@@ -122,19 +98,19 @@ def _big_team_parts(settings: BenchmarkSettings) -> Iterator[Part]:
         ("random", "robots", settings.big_random, {}),
         ("warehouse", "robots", settings.big_warehouse, {}),
         ("warehouse", "differential drives", settings.big_drives, {"model": "differential_drive"}),
-        ("warehouse", "boxes", settings.big_boxes, BOXES),
-        ("warehouse", "boxes without goal headings", settings.big_free_boxes, {"footprint": BOXES["footprint"]}),
+        ("warehouse", "boxes", settings.big_boxes, probes.BOXES),
+        ("warehouse", "boxes without goal headings", settings.big_free_boxes, {"footprint": probes.BOXES["footprint"]}),
     )
     for scenario, what, sizes, robots in teams:
         for size in sizes:
-            plan = partial(measure_big_team, scenario, what, size, *limits, **robots)
+            plan = partial(probes.measure_big_team, scenario, what, size, *limits, **robots)
             yield "big teams", f"first plans of {size} {what}, {scenario}", plan
     for size in settings.improved_robots:
-        work = partial(measure_improvement, "random", size, settings.big_seeds, settings.improving_limit)
+        work = partial(probes.measure_improvement, "random", size, settings.big_seeds, settings.improving_limit)
         yield "improvement", f"improving plans of {size} robots", work
     for size in settings.loop_robots:
-        for share, what in ((None, ""), (DEADLINE, " with a deadline")):
-            loops = partial(measure_big_loops, size, settings.loops, share)
+        for share, what in ((None, ""), (probes.DEADLINE, " with a deadline")):
+            loops = partial(probes.measure_big_loops, size, settings.loops, share)
             yield "big loops", f"control loops of {size} robots{what}", loops
 
 
@@ -152,22 +128,24 @@ def _denoising_parts(settings: BenchmarkSettings, fast: Set[str]) -> Iterator[Pa
 
 
 def _environment_parts(settings: BenchmarkSettings) -> Iterator[Part]:
-    for num_boxes in (0, *settings.far_obstacles):
-        among = f" among {num_boxes} boxes" if num_boxes else ""
-        yield "environments", f"one environment{among}", partial(measure_env, settings, num_boxes)
-        yield "environments", f"{settings.num_worlds} worlds{among}", partial(measure_worlds, settings, num_boxes)
-    for what, measurement in (("one environment", measure_env), (f"{settings.num_worlds} worlds", measure_worlds)):
-        disturbed = partial(measurement, settings, 0, DISTURBANCES)
-        yield "environments", f"{what} with {len(DISTURBANCES)} disturbances", disturbed
-        yield "environments", f"{what} of rectangles", partial(measurement, settings, 0, footprint=RECTANGLE)
-        for num_boxes in (0, RAY_BOXES):
-            among = f" among {num_boxes} boxes" if num_boxes else ""
-            sensing = partial(measurement, settings, num_boxes, num_rays=RAYS)
-            yield "environments", f"{what} with {RAYS} rays{among}", sensing
-    yield "environments", "rooms, along paths", partial(measure_rooms, settings)
-    yield "environments", f"{settings.num_worlds} worlds in JAX", partial(measure_functional, settings)
-    for model in RIGID if find_spec("mujoco") else ():
-        yield "environments", f"one environment of {model} in MuJoCo", partial(measure_rigid, settings, model)
+    for batched, what in ((False, "one environment"), (True, f"{settings.num_worlds} worlds")):
+        measurement = partial(env_steps.measure_env, settings, batched)
+        for num_boxes in (0, *settings.far_obstacles):
+            yield "environments", f"{what}{_among(num_boxes)}", partial(measurement, num_boxes)
+        disturbed = partial(measurement, 0, env_steps.DISTURBANCES)
+        yield "environments", f"{what} with {len(env_steps.DISTURBANCES)} disturbances", disturbed
+        yield "environments", f"{what} of rectangles", partial(measurement, footprint=env_steps.RECTANGLE)
+        for num_boxes in (0, env_steps.RAY_BOXES):
+            sensing = partial(measurement, num_boxes, num_rays=env_steps.RAYS)
+            yield "environments", f"{what} with {env_steps.RAYS} rays{_among(num_boxes)}", sensing
+    yield "environments", "rooms, along paths", partial(env_steps.measure_rooms, settings)
+    yield "environments", f"{settings.num_worlds} worlds in JAX", partial(env_steps.measure_functional, settings)
+    for model in env_steps.RIGID if find_spec("mujoco") else ():
+        yield "environments", f"one environment of {model} in MuJoCo", partial(env_steps.measure_rigid, settings, model)
+
+
+def _among(num_boxes: int) -> str:
+    return f" among {num_boxes} boxes" if num_boxes else ""
 
 
 def run_parts(todo: Sequence[Part], progress: Callable[[str, int, int], object]) -> dict[str, list[Measurement]]:
@@ -255,9 +233,9 @@ def _measure_threads(settings: BenchmarkSettings, num_robots: int, threads: int)
     }
 
 
-def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where) -> Measurement:
+def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: probes.Where) -> Measurement:
     """An iteration of the paper's planner among boxes, beside one in the open, and verify()."""
-    problem = boxed_problem(num_boxes, where)
+    problem = probes.boxed_problem(num_boxes, where)
     noise_scale = _d4orm(preset="paper", num_steps=settings.num_steps).noise_scale()
     controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
     controls[:40] = 0.5 * (problem.goal - problem.start[:, :2]) / np.linalg.norm(problem.goal, axis=1)[:, None]
@@ -289,9 +267,6 @@ def _measure_plans(settings: BenchmarkSettings, engine: str, preset: str | None,
         "engine": engine,
         "rules": preset or "default",
         "num_robots": num_robots,
-        "seeds": settings.seeds,
-        "solved": sum(plan.solved for plan in plans),
-        "seconds": Spread.of([plan.wall_time for plan in plans]),
         "iterations": Spread.of([plan.iterations for plan in plans]),
-        "travel_time": Spread.of([plan.metrics["travel_time"] for plan in plans]),
+        **probes.figures_of(plans),
     }

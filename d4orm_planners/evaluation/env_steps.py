@@ -44,16 +44,21 @@ RAYS, RAY_BOXES = 32, 100
 
 def measure_env(
     settings: BenchmarkSettings,
-    num_boxes: int,
+    batched: bool,
+    num_boxes: int = 0,
     disturbances: Sequence[AnyDisturbance] = (),
     num_rays: int = 0,
     footprint: Footprint | None = None,
 ) -> Measurement:
-    """One PettingZoo environment of 8 robots under random controls, resets included."""
-    problem = boxed_problem(num_boxes, "near", footprint)
-    env = navigation_v0.parallel_env(problem=problem, disturbances=disturbances, observed_rays=num_rays)
-    seconds = _measure_steps(settings, env, settings.env_steps)
-    return _rate("parallel_env" + _variant(num_rays, footprint), 1, num_boxes, disturbances, seconds)
+    """One PettingZoo environment of 8 robots, or the batched one, under random controls, resets included."""
+    problem, size = boxed_problem(num_boxes, "near", footprint), settings.num_worlds if batched else 1
+    options: dict[str, Any] = {"problem": problem, "disturbances": disturbances, "observed_rays": num_rays}
+    if batched:
+        seconds = _measure_batch(settings, size, **options)
+    else:
+        seconds = _measure_steps(settings, navigation_v0.parallel_env(**options), settings.env_steps)
+    variant = (f", {num_rays} rays" if num_rays else "") + (", rectangles" if footprint else "")
+    return _rate(("make_vec" if batched else "parallel_env") + variant, size, num_boxes, disturbances, seconds)
 
 
 def measure_rigid(settings: BenchmarkSettings, model: str) -> Measurement:
@@ -84,21 +89,8 @@ def _measure_steps(settings: BenchmarkSettings, env: ParallelEnv, count: int) ->
     return spread.times(1 / count)
 
 
-def measure_worlds(
-    settings: BenchmarkSettings,
-    num_boxes: int,
-    disturbances: Sequence[AnyDisturbance] = (),
-    num_rays: int = 0,
-    footprint: Footprint | None = None,
-) -> Measurement:
-    """The batched environment of 8 robots per world under random controls, auto-reset included."""
-    size, problem = settings.num_worlds, boxed_problem(num_boxes, "near", footprint)
-    seconds = _measure_batch(settings, size, problem=problem, disturbances=disturbances, observed_rays=num_rays)
-    return _rate("make_vec" + _variant(num_rays, footprint), size, num_boxes, disturbances, seconds)
-
-
 def measure_rooms(settings: BenchmarkSettings) -> Measurement:
-    """The same in eight rooms that worlds draw from, where robots see their paths and are paid along them."""
+    """The batched one in eight rooms that worlds draw from, where robots see their paths and are paid along them."""
     size = max(1, settings.num_worlds // 8)
     along = {"observed_path": True, "progress": "path", "reward": "training"}
     seconds = _measure_batch(settings, size, scenario="rooms", num_robots=8, num_instances=8, **along)
@@ -148,10 +140,6 @@ def measure_functional(settings: BenchmarkSettings) -> Measurement:
     state, _ = begin(jax.random.split(jax.random.key(0), size))
     spread = measure(settings, lambda: jax.block_until_ready(steps(state, jax.random.key(1))))
     return _rate("FunctionalEnv", size, 0, (), spread.times(1 / (calls * size)))
-
-
-def _variant(num_rays: int, footprint: Footprint | None) -> str:
-    return (f", {num_rays} rays" if num_rays else "") + (", rectangles" if footprint else "")
 
 
 def _rate(

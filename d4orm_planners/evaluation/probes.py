@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -20,6 +21,7 @@ from d4orm_env.footprints import Box, Footprint
 from d4orm_env.geometry.world_index import build_index
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.controller import Controller, Mode
+from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner_registry import make_planner, make_policy
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.evaluation.measuring import BenchmarkSettings, Measurement, Spread, measure
@@ -197,7 +199,14 @@ def measure_big_team(
     return {
         "scenario": f"{scenario}, {what}" if robots else scenario,
         "num_robots": num_robots,
-        "seeds": seeds,
+        **figures_of(plans),
+    }
+
+
+def figures_of(plans: Sequence[Plan]) -> Measurement:
+    """Plans of one problem's seeds in numbers; one that is no solution counts with the time that it took to give up."""
+    return {
+        "seeds": len(plans),
         "solved": sum(plan.solved for plan in plans),
         "seconds": Spread.of([plan.wall_time for plan in plans]),
         "travel_time": Spread.of([plan.metrics["travel_time"] for plan in plans]),
