@@ -23,8 +23,14 @@ class Body(NamedTuple):
     hitch: float
 
 
-def check_footprints(footprints: Sequence[Footprint], models: Sequence[Model]) -> None:
-    """Refuse footprints that are none, of another dimension, or without a robot's trailers."""
+def checked_footprints(given: Footprint | Sequence[Footprint], models: Sequence[Model]) -> tuple[Footprint, ...]:
+    """``K`` footprints, given as one for all or one each, of the robots' dimension and with their trailers."""
+    footprints = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,) * len(models)
+    if len(footprints) != len(models):
+        raise ValueError(
+            f"footprint has {len(footprints)} entries for {len(models)} robots; give one for each, such as "
+            "Box(0.5, 0.25), or one for all"
+        )
     for robot, (footprint, model) in enumerate(zip(footprints, models, strict=True)):
         where = f"footprint of robot_{robot}"
         if not isinstance(footprint, Footprint):
@@ -40,6 +46,7 @@ def check_footprints(footprints: Sequence[Footprint], models: Sequence[Model]) -
                 f"{where} has {pulled} trailers, and a {model.name} pulls {len(model.trailers)}; give such as "
                 "Train(Box(0.5, 0.25), [Box(0.3, 0.25)])"
             )
+    return footprints
 
 
 def find_bodies(footprints: Sequence[Footprint], models: Sequence[Model], hitches: Iterable[float]) -> tuple[Body, ...]:

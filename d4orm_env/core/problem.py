@@ -284,11 +284,7 @@ class Problem(Frozen):
         )
 
     def select(self, robots: Sequence[int]) -> Problem:
-        """The problem of these robots only, in the order given.
-
-        Raises:
-            ValueError: If a number is no robot's.
-        """
+        """The problem of these robots only, in the order given; a number that is no robot's is a ValueError."""
         index = list(robots)
         team = self.team.select(index)
         names = ("goal", "goal_speed", "goal_heading", "goal_heading_tolerance", "goal_hitches")

@@ -9,15 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from d4orm_env.core.arrays import (
-    LARGEST,
-    SMALLEST,
-    FloatArray,
-    Floats,
-    positive_number,
-    short_repr,
-    whole_number,
-)
+from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, Floats, positive_number, short_repr, whole_number
 from d4orm_env.core.bodies import body_poses
 from d4orm_env.core.gaps import gaps_at, near_pairs, world_gap
 from d4orm_env.core.goal_poses import states_at_goals

@@ -22,7 +22,7 @@ from d4orm_env.core.arrays import (
     short_repr,
     whole_number,
 )
-from d4orm_env.core.bodies import Body, FootprintArrays, as_arrays, body_poses, check_footprints, find_bodies
+from d4orm_env.core.bodies import Body, FootprintArrays, as_arrays, body_poses, checked_footprints, find_bodies
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
 from d4orm_env.footprints import Disc, Footprint, Train
@@ -89,9 +89,11 @@ class Team(Frozen):
             raise ValueError(f"models {sorted(set(models))} mix 2D and 3D robots; a team moves in one dimension")
         limits = zip(STANDARD_LIMITS, (max_speed, max_acceleration, max_turn_rate), strict=True)
         self._set(models=tuple(models), **{name: frozen_per_robot(value, name, len(models)) for name, value in limits})
-        self._set(own_limits=self._complete_own_limits(own_limits))
-        self._set(margin=positive_number(margin, "margin", zero_allowed=True, most=LARGEST))
-        self._set(lag=frozen_per_robot(lag, "lag", len(models), zero_allowed=True))
+        self._set(
+            own_limits=self._complete_own_limits(own_limits),
+            margin=positive_number(margin, "margin", zero_allowed=True, most=LARGEST),
+            lag=frozen_per_robot(lag, "lag", len(models), zero_allowed=True),
+        )
         self._set_footprints(radius, footprint)
 
     def _set_footprints(self, radius: ArrayLike | None, given: Footprint | Sequence[Footprint] | None) -> None:
@@ -105,13 +107,7 @@ class Team(Frozen):
             discs = [Disc(float(str(size))) for size in radii]  # the decimal that files have
             given = [Train(disc, (disc,) * size) if size else disc for disc, size in zip(discs, trailers, strict=True)]
             radius = None
-        footprints = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,) * count
-        if len(footprints) != count:
-            raise ValueError(
-                f"footprint has {len(footprints)} entries for {count} robots; give one for each, such as "
-                "Box(0.5, 0.25), or one for all"
-            )
-        check_footprints(footprints, self.robot_models)
+        footprints = checked_footprints(given, self.robot_models)
         outer = [self._outer_radius(robot, footprint) for robot, footprint in enumerate(footprints)]
         radii = frozen_per_robot(outer, "radius", count)
         if radius is not None and (frozen_per_robot(radius, "radius", count) != radii).any():
@@ -279,21 +275,15 @@ class Team(Frozen):
         return read_only(np.array([model.turning_radius(limits) for model, limits in models], np.float32))
 
     def select(self, robots: Sequence[int]) -> Team:
-        """The team of these robots only, in the order given.
-
-        Raises:
-            ValueError: If a number is no robot's.
-        """
+        """The team of these robots only, in the order given; a number that is no robot's is a ValueError."""
         index = [whole_number(robot, "robot", 0, self.num_robots - 1) for robot in robots]
-        standard = {name: getattr(self, name)[index] for name in STANDARD_LIMITS}
         own = {limit.name for robot in index for limit in self.robot_models[robot].own_limits}
         return Team(
             tuple(self.models[robot] for robot in index),
             None if self.shapes else self.radius[index],
-            **standard,
+            **{name: getattr(self, name)[index] for name in (*STANDARD_LIMITS, "lag")},
             own_limits={name: values[index] for name, values in self.own_limits.items() if name in own},
             footprint=[self.shapes[robot] for robot in index] if self.shapes else None,
-            lag=self.lag[index],
             margin=self.margin,
         )
 
