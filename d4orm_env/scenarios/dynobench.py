@@ -28,15 +28,7 @@ from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.footprints import Box, Disc
-from d4orm_env.scenarios.dynobench_types import (
-    DYNAMICS,
-    MODELS,
-    checked_types,
-    footprint_of,
-    limits_of,
-    model_name,
-    symmetric,
-)
+from d4orm_env.scenarios import dynobench_types as kinds
 
 DT = 0.1
 """Time step of all their models in the plane [s]."""
@@ -73,7 +65,7 @@ def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[st
             unknown, or a robot must not be at rest at its goal, which is not planned for; the message names the file,
             and all types that are unknown.
     """
-    known = MODELS | checked_types({} if models is None else models)
+    known = kinds.MODELS | kinds.checked_types({} if models is None else models)
     path = checked_path(path, "a problem of dynobench")
     with naming(path):
         try:
@@ -100,15 +92,15 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: Path) -> 
             f"robot types {', '.join(unknown)} are unknown; known are {', '.join(models)}, or give "
             f"their parameters as models={{type: {{'dynamics': ...}}}}"
         )
-    parameters = [symmetric(models[name]) | models[name] for name in types]
-    names = tuple(map(model_name, parameters))
+    parameters = [kinds.symmetric(models[name]) | models[name] for name in types]
+    names = tuple(map(kinds.model_name, parameters))
     team = Team(
         names,
         max_speed=[own["max_vel"] for own in parameters],
         max_acceleration=[own.get("max_acc") or own.get("max_acc_abs") or 1.0 for own in parameters],
         max_turn_rate=[own.get("max_angular_vel", 1.0) for own in parameters],
         own_limits=_own_limits(parameters, names),
-        footprint=[footprint_of(own) for own in parameters],
+        footprint=[kinds.footprint_of(own) for own in parameters],
     )
     start, goal = _starts_and_goals(robots, team)
     turning = np.array([model.heading_index is not None for model in team.robot_models])
@@ -144,8 +136,8 @@ def _starts_and_goals(robots: list[Mapping[str, Any]], team: Team) -> tuple[Floa
 
 def _own_limits(parameters: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, list[float]]:
     """``(K,)`` values by name; one where a robot has no such limit."""
-    known, given = [{limit.name for limit in get_model(name).own_limits} for name in names], map(limits_of, parameters)
-    own = [{name: limits[name] for name in has} for has, limits in zip(known, given, strict=True)]
+    given = zip(names, map(kinds.limits_of, parameters), strict=True)
+    own = [{limit.name: limits[limit.name] for limit in get_model(name).own_limits} for name, limits in given]
     return {name: [limits.get(name, 1.0) for limits in own] for name in dict.fromkeys(chain(*own))}
 
 
@@ -234,7 +226,7 @@ def _turn_as_theirs(headings: Floats, rates: Floats) -> None:
 
 def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
     """The lines of a result file: states and actions of every robot, until it rests at its goal for good."""
-    known = {ours: theirs for theirs, ours in DYNAMICS.items()}
+    known = {ours: theirs for theirs, ours in kinds.DYNAMICS.items()}
     known |= {"unicycle": "unicycle1"} | {f"car_with_{count}_trailers": "car_with_trailers" for count in (2, 3)}
     yield "result:"
     for robot, model in enumerate(problem.team.robot_models):

@@ -16,7 +16,7 @@ from d4orm_env.core.portable import cos, root, sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.layout import Layout, PlacementArea, build, in_space, round_up, scatter
-from d4orm_env.scenarios.settings import OBSTACLES, STARTS_AND_GOALS, Settings, bounded, require_plane, require_space
+from d4orm_env.scenarios.settings import OBSTACLES, STARTS_AND_GOALS, Settings, bounded, require_dimension
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
@@ -156,7 +156,7 @@ def paper_random(settings: Settings) -> Problem:
     is the first of 1 000 uniform points of the square that is 5 to 6 m from its goal and six radii from all starts
     before it; where none is, all are drawn again, up to 20 times. That places 64 robots, and never 100.
     """
-    require_plane(settings)
+    require_dimension(settings, 2)
     side = math.isqrt(settings.num_robots - 1) + 1
     across = np.linspace(-SIDE / 2, SIDE / 2, side)
     goals: Floats = np.column_stack([np.tile(across, side), np.repeat(across, side)])[: settings.num_robots]
@@ -224,7 +224,7 @@ def mixed_team(settings: Settings, first: tuple[str, float], second: tuple[str, 
 
 def antipodal_sphere(settings: Settings, diameter: float) -> Layout:
     """Robots on the Fibonacci points of a sphere, goals at the antipodes."""
-    require_space(settings)
+    require_dimension(settings, 3)
     points = fibonacci_sphere(settings.num_robots)
     gaps = (np.linalg.norm(points[:index] - points[index], axis=1).min() for index in range(1, len(points)))
     needed = 2 * settings.spacing / float(min(gaps, default=np.inf))

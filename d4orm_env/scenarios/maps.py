@@ -16,7 +16,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.grid_map import MAX_BYTES, MAX_CELLS, GridMap, grid_of_fields, read_occupancy_image
 from d4orm_env.scenarios.layout import Layout, build
-from d4orm_env.scenarios.settings import Settings, bounded, require_plane
+from d4orm_env.scenarios.settings import Settings, bounded, require_dimension
 from d4orm_env.scenarios.well_formed import FreeSpace, free_space, populate, safety_distance_of, with_obstacles
 
 PASSABLE, BLOCKED = b".GSE", b"@OTW"
@@ -182,7 +182,7 @@ def map(
             f"scenario {settings.scenario!r} needs map=, the path of a .map file, of a map_server .yaml file, or of a "
             ".png or .pgm image with its resolution="
         )
-    require_plane(settings)
+    require_dimension(settings, 2)
     grid, safety_distance = read_map(map, cell, resolution), safety_distance_of(settings)
     step = grid.lattice_step(safety_distance)
     space = free_space(grid.world, safety_distance, step)

@@ -71,10 +71,8 @@ class Scenario:
     @property
     def arguments(self) -> tuple[str, ...]:
         """All arguments of :meth:`problem`."""
-        if self.known:
-            return self.known
-        settings = [parameter.name for parameter in self._parameters[2:] if parameter.kind in _KEYWORDS]
-        return (*settings, "num_robots", "seed")
+        own = (parameter.name for parameter in self._parameters[2:] if parameter.kind in _KEYWORDS)
+        return self.known or (*own, "num_robots", "seed")
 
     def complaint(self, names: Iterable[str], others: Iterable[str] = ()) -> str:
         """Describe the first of ``names`` that neither this nor the caller, ``others``, takes; ``""`` for none."""
@@ -86,8 +84,8 @@ class Scenario:
         """See :func:`make_problem`."""
         given = {name: value for name, value in arguments.items() if value is not None}
         # Whatever the scenario, leaving a common argument out is no mistake.
-        complaint = self.complaint(name for name in arguments if name in given or name not in COMMON_ARGUMENTS)
-        if complaint:
+        named = (name for name in arguments if name in given or name not in COMMON_ARGUMENTS)
+        if complaint := self.complaint(named):
             raise UnknownKeywordError(complaint)
         return self._make(num_robots, seed, given)
 
@@ -227,11 +225,7 @@ def list_scenarios() -> tuple[str, ...]:
 
 
 def describe_scenario(name: str) -> str:
-    """One line on a scenario.
-
-    Raises:
-        ValueError: If there is no such scenario.
-    """
+    """One line on a scenario; a name that none has is a ValueError."""
     return SCENARIOS.look_up(name).description
 
 
@@ -247,9 +241,7 @@ def _file(path: str | os.PathLike[str], seed: int = 0, num_robots: int | None = 
 
 def is_scenario_file(scenario: object) -> TypeGuard[str | os.PathLike[str]]:
     """Check whether a scenario is given as the path of a file."""
-    if isinstance(scenario, str):
-        return is_yaml_path(scenario)
-    return isinstance(scenario, os.PathLike)
+    return is_yaml_path(scenario) if isinstance(scenario, str) else isinstance(scenario, os.PathLike)
 
 
 def find_scenario(scenario: ScenarioLike) -> Scenario:

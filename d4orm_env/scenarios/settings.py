@@ -115,21 +115,13 @@ def bounded(value: SupportsFloat, name: str, *, zero_allowed: bool = False) -> f
     return number
 
 
-def require_plane(settings: Settings) -> None:
-    """Check that a scenario of the plane is asked for robots of the plane."""
-    if settings.team.dimension != 2:
+def require_dimension(settings: Settings, dimension: int) -> None:
+    """Check that a scenario of the plane, or in space, is asked for robots of the same."""
+    if settings.team.dimension != dimension:
+        kind, other = ("planar", "forest") if dimension == 2 else ("three-dimensional", "circle")
         raise ValueError(
-            f"scenario {settings.scenario!r} is planar and model {settings.model!r} is not; "
-            f"use model='holonomic2d', or scenario 'forest'"
-        )
-
-
-def require_space(settings: Settings) -> None:
-    """Check that a scenario in space is asked for robots in space."""
-    if settings.team.dimension != 3:
-        raise ValueError(
-            f"scenario {settings.scenario!r} is three-dimensional and model {settings.model!r} is not; "
-            f"use model='holonomic3d', or scenario 'circle'"
+            f"scenario {settings.scenario!r} is {kind} and model {settings.model!r} is not; "
+            f"use model='holonomic{dimension}d', or scenario {other!r}"
         )
 
 

@@ -12,7 +12,7 @@ from d4orm_env.core.arrays import BoolArray, positive_number
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.settings import WALLS, Settings, bounded, grid_size, require_plane
+from d4orm_env.scenarios.settings import WALLS, Settings, bounded, grid_size, require_dimension
 from d4orm_env.scenarios.well_formed import lattice_step, populate, safety_distance_of
 
 sparse: Any = LazyModule("scipy.sparse")
@@ -123,7 +123,7 @@ def rooms(
         door_width: Width of the doors [m].
         extra_doors: Share of the walls without a door that get one all the same.
     """
-    require_plane(settings)
+    require_dimension(settings, 2)
     size = default_squares(settings.num_robots / 2, 3) if rooms is None else grid_size(rooms, "rooms")
     side, width = bounded(room_size, "room_size"), bounded(door_width, "door_width")
     share = positive_number(extra_doors, "extra_doors", zero_allowed=True, most=1.0)
@@ -145,7 +145,7 @@ def maze(
         corridor_width: Width of the corridors [m].
         loops: Share of the walls of a maze without loops that are left out.
     """
-    require_plane(settings)
+    require_dimension(settings, 2)
     width = bounded(corridor_width, "corridor_width")
     if cells is None:
         # Where two robots cannot pass each other, every position takes a dead end.

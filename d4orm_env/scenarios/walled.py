@@ -14,16 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.generators import antipodal_circle
 from d4orm_env.scenarios.layout import build, round_up
-from d4orm_env.scenarios.settings import (
-    JITTER,
-    MAX_COUNT,
-    WALLS,
-    Settings,
-    bounded,
-    grid_size,
-    require_plane,
-    require_space,
-)
+from d4orm_env.scenarios.settings import JITTER, MAX_COUNT, WALLS, Settings, bounded, grid_size, require_dimension
 from d4orm_env.scenarios.well_formed import lattice_step, populate, safety_distance_of
 
 DOOR_DEPTH = 0.2
@@ -75,7 +66,7 @@ def doorway(settings: Settings, *, door_width: float = 0.6, room_size: float | N
 def _two_rooms(
     settings: Settings, length: float, passage: tuple[str, float], bays: int, room_size: float | None
 ) -> Problem:
-    require_plane(settings)
+    require_dimension(settings, 2)
     name, width = passage
     # A bay is deep enough that a robot in it lets another pass.
     separation = settings.spacing + 2 * safety_distance_of(settings)
@@ -133,7 +124,7 @@ def warehouse(
         shelf_width: Along y [m].
         aisle_width: Width of all aisles [m].
     """
-    require_plane(settings)
+    require_dimension(settings, 2)
     counts = grid_size((2, max(3, -(-settings.num_robots // 4))) if shelves is None else shelves, "shelves")
     size = np.array([bounded(shelf_length, "shelf_length"), bounded(shelf_width, "shelf_width")])
     aisle = bounded(aisle_width, "aisle_width")
@@ -215,7 +206,7 @@ def mmd_map(boxes: Sequence[Box], settings: Settings, *, side: float | None = No
         settings: The common arguments.
         side: Of the map [m]; by default 6 m, and in proportion to the number of robots' root for more than 20.
     """
-    require_plane(settings)
+    require_dimension(settings, 2)
     if side is None:
         side = SIDE * max(1.0, root(settings.num_robots / ROBOTS, 2))
     half = bounded(side, "side") / 2
@@ -247,7 +238,7 @@ def amswarm(centres: Sequence[tuple[float, float]], settings: Settings, *, jitte
         settings: The common arguments; ten robots.
         jitter: Each coordinate of each start is moved by a uniform random number within +-``jitter`` [m].
     """
-    require_space(settings)
+    require_dimension(settings, 3)
     if settings.num_robots != 10:
         raise ValueError(
             f"num_robots is {settings.num_robots}; scenario {settings.scenario!r} has exactly 10 robots, so leave "
