@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import IntEnum
 
 import numpy as np
+
+from d4orm_env.core.arrays import LARGEST_WHOLE, short_repr, whole_number
 
 
 class Stream(IntEnum):
@@ -56,3 +59,13 @@ def _sequence(seed: int, stream: Stream, key: tuple[int, ...]) -> np.random.Seed
     # A spawn key is hashed after the seed, filled up to full length: the two cannot be mistaken for each other as the
     # words of a list can, where [5] is [5, 0].
     return np.random.SeedSequence(seed, spawn_key=(int(stream), *key))
+
+
+def checked_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
+    """Seeds of several episodes, each once, at least one, and none larger than files have room for."""
+    if not isinstance(seeds, Iterable) or getattr(seeds, "ndim", 1) == 0:
+        raise ValueError(f"seeds is {short_repr(seeds)}; give the seeds themselves, as range(50)")
+    checked = tuple(dict.fromkeys(whole_number(seed, "seed", 0, LARGEST_WHOLE) for seed in seeds))
+    if not checked:
+        raise ValueError("seeds is empty; give at least one")
+    return checked

@@ -12,9 +12,10 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from d4orm_env.core.arrays import LARGEST_WHOLE, duration, positive_number, short_repr, whole_number
+from d4orm_env.core.arrays import duration, positive_number, short_repr
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import checked_seeds
 from d4orm_env.disturbances import Disturbance
 from d4orm_env.disturbances.disturbance import AnyDisturbance, checked_disturbances
 from d4orm_env.disturbances.disturbance_registry import attributes_of, disturbance_at
@@ -73,7 +74,7 @@ class Study:
         for name in self.observation:
             if name not in OBSERVATION:
                 raise unknown("observation", name, OBSERVATION)
-        policies, seeds = self.configurations(), _checked_seeds(self.seeds)
+        policies, seeds = self.configurations(), checked_seeds(self.seeds)
         cells = self._problems(seeds)
         for problem in (problems[0] for _, problems in cells):
             for condition in under:
@@ -204,18 +205,6 @@ def _load(path: Path) -> Problem:
     problem = load_problem(path)
     # Two files that give no name still differ.
     return problem.replace(name=path.stem) if problem.name == "custom" else problem
-
-
-def _checked_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
-    """Seeds, each once."""
-    if not isinstance(seeds, Iterable) or getattr(seeds, "ndim", 1) == 0:
-        raise ValueError(f"seeds is {short_repr(seeds)}; give the seeds themselves, as range(50)")
-    checked = tuple(dict.fromkeys(whole_number(seed, "seed", 0) for seed in seeds))
-    if not checked:
-        raise ValueError("seeds is empty; give at least one")
-    if (largest := max(checked)) > LARGEST_WHOLE:
-        raise ValueError(f"seed is {largest}; a store of trials has room for seeds up to {LARGEST_WHOLE}")
-    return checked
 
 
 def _several(values: T | Iterable[T], name: str = "") -> tuple[T, ...]:

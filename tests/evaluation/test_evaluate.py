@@ -680,7 +680,7 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
         ({"seeds": []}, "seeds is empty"),
         ({"seeds": 5}, r"seeds is 5; give the seeds themselves, as range\(50\)"),
         ({"seeds": [0.5]}, "seed must be a whole number, not 0.5"),
-        ({"seeds": [2**63]}, "seed is 9223372036854775808; a store of trials has room for seeds up to"),
+        ({"seeds": [2**63]}, "seed is about 1e19; it must be at most 9223372036854775807"),
         ({"control_noise_std": []}, "control_noise_std is empty"),
         ({"disturbances": {"": [Delay(1)]}}, "give levels by name, as {'delay'"),
         ({"disturbances": {3: [1]}}, "disturbances is {3: .*; give levels by name, as {'delay'"),

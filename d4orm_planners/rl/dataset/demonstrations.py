@@ -16,18 +16,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from d4orm_env import __version__, navigation_v0
-from d4orm_env.core.arrays import (
-    LARGEST_WHOLE,
-    BoolArray,
-    FloatArray,
-    as_float32,
-    plain_number,
-    short_repr,
-    whole_number,
-)
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, plain_number, short_repr
 from d4orm_env.core.files import ArrayArchive, replaced_when_done
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import source_digest
+from d4orm_env.core.seeds import checked_seeds
 from d4orm_env.disturbances.disturbance import Disturbance
 from d4orm_env.envs.team_step import TeamStep
 from d4orm_planners.base.episode import run_episode
@@ -88,12 +81,7 @@ class Demonstrations:
                 raise ValueError(f"{name} is {short_repr(given)}; give arguments by name, in a mapping")
         if self.only_success not in (True, False):
             raise ValueError(f"only_success is {short_repr(self.only_success)}; it must be True or False")
-        if not isinstance(self.seeds, Iterable) or getattr(self.seeds, "ndim", 1) == 0:
-            raise ValueError(f"seeds is {short_repr(self.seeds)}; give the seeds themselves, as range(100)")
-        seeds = tuple(dict.fromkeys(whole_number(seed, "seed", 0, LARGEST_WHOLE) for seed in self.seeds))
-        if not seeds:
-            raise ValueError("seeds is empty; give at least one")
-        object.__setattr__(self, "seeds", seeds)
+        object.__setattr__(self, "seeds", checked_seeds(self.seeds))
         object.__setattr__(self, "_source", origin(self.policy))
         if self.environment.get("render_mode") is not None:
             raise ValueError("render_mode is for looking on; a dataset records without, so leave it out")
