@@ -13,24 +13,8 @@ import math
 from collections.abc import Callable
 from itertools import chain
 
-from d4orm_env.dynamics.formulas import (
-    at_once,
-    clip,
-    commanded_drive,
-    first_order_approach,
-    limit_drive,
-    turn_towards,
-)
-from d4orm_env.dynamics.robot_model import (
-    OWN_LIMITS,
-    SPEED,
-    Limit,
-    Model,
-    ModelFunctions,
-    Ops,
-    TimeStep,
-    Vector,
-)
+from d4orm_env.dynamics.formulas import at_once, clip, commanded_drive, first_order_approach, limit_drive, turn_towards
+from d4orm_env.dynamics.robot_model import OWN_LIMITS, SPEED, Limit, Model, ModelFunctions, Ops, TimeStep, Vector
 
 MAX_STEERING, MAX_REVERSE_SPEED, WHEELBASE, HITCH_1, HITCH_2, HITCH_3 = (OWN_LIMITS + i for i in (0, 1, 2, 3, 5, 7))
 """Of a hitch the largest angle, in the next column its length."""

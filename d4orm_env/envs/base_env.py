@@ -25,7 +25,6 @@ from d4orm_env.envs.team_step import TeamStep
 
 if TYPE_CHECKING:
     from d4orm_env.render import frames
-    from d4orm_env.render.frames import FrameRenderer, WindowRenderer
 else:
     frames = LazyModule("d4orm_env.render.frames")
 
@@ -152,7 +151,7 @@ class Viewer:
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ValueError(f"render_mode is {render_mode!r}; choose one of {', '.join(RENDER_MODES)}, or None")
         self._mode = render_mode
-        self._renderer: FrameRenderer | WindowRenderer | None = None
+        self._renderer: frames.FrameRenderer | frames.WindowRenderer | None = None
         self._problem: Problem | None = None
 
     def __getstate__(self) -> dict[str, object]:
@@ -184,7 +183,7 @@ class Viewer:
             self._renderer.close()
         self._renderer = self._problem = None
 
-    def _open(self, problem: Problem) -> FrameRenderer | WindowRenderer:
+    def _open(self, problem: Problem) -> frames.FrameRenderer | frames.WindowRenderer:
         return frames.FrameRenderer(problem) if self._mode == "rgb_array" else frames.WindowRenderer(problem)
 
 

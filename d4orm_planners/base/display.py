@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from d4orm_env.render import pictures, replay
-    from d4orm_env.render.replay import Denoising, Replay, ReplayMotion
 else:
     pictures = LazyModule("d4orm_env.render.pictures")
     replay = LazyModule("d4orm_env.render.replay")
@@ -73,7 +72,7 @@ class DisplayMixin:
         """
         return pictures.plot(self.problem, self.trajectory, axes)
 
-    def motion(self, title: str | None = None, denoising: Denoising | None = None) -> ReplayMotion:
+    def motion(self, title: str | None = None, denoising: replay.Denoising | None = None) -> replay.ReplayMotion:
         """Return the motion of a replay; :class:`d4orm_env.render.replay.Replay` puts several side by side.
 
         Args:
@@ -88,7 +87,7 @@ class DisplayMixin:
             self.problem, self.trajectory, title, figures, goals=goals, denoising=denoising, bodies=bodies
         )
 
-    def animate(self) -> Replay:
+    def animate(self) -> replay.Replay:
         """A replay that notebooks show where it is the last value of a cell."""
         return replay.Replay(self.title, (self.motion(),))
 

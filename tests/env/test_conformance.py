@@ -8,14 +8,7 @@ from typing import Any
 
 import pytest
 from env_support import line_problem, mixed_problem, sampled_actions, scenario_params
-from pettingzoo.test import (
-    api_test,
-    max_cycles_test,
-    parallel_api_test,
-    parallel_seed_test,
-    render_test,
-    seed_test,
-)
+from pettingzoo.test import api_test, max_cycles_test, parallel_api_test, parallel_seed_test, render_test, seed_test
 from pettingzoo.test.state_test import state_test
 
 from d4orm_env import navigation_v0

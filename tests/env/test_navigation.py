@@ -6,14 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from env_support import (
-    act,
-    line_problem,
-    mixed_problem,
-    sampled_actions,
-    scenario_params,
-    straight_drive,
-)
+from env_support import act, line_problem, mixed_problem, sampled_actions, scenario_params, straight_drive
 from gymnasium.utils.env_checker import data_equivalence
 from pettingzoo.utils import aec_to_parallel
 

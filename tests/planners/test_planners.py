@@ -12,14 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_support import engine_noise
-from planner_support import (
-    Recorder,
-    algorithm_1,
-    cheap_planner,
-    hop_problem,
-    softmax,
-    walled_in_problem,
-)
+from planner_support import Recorder, algorithm_1, cheap_planner, hop_problem, softmax, walled_in_problem
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream

@@ -19,17 +19,7 @@ import pytest
 
 pytest.importorskip("viser")
 
-from play_support import (
-    CAMERA,
-    TIMEOUT,
-    control,
-    drag,
-    running,
-    say,
-    until,
-    update,
-    visitor,
-)
+from play_support import CAMERA, TIMEOUT, control, drag, running, say, until, update, visitor
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 
