@@ -180,7 +180,7 @@ class EnvSetup:
         if self.along_paths:
             drawn.shortest_paths.check_reachable()
         names = set(drawn.arrays._fields) - {*OWN_ARRAYS, *_WORLD_ARRAYS, "grid", "footprints"} if self._batched else ()
-        differing = self._differing(drawn, names)
+        differing = self.differing(drawn, names)
         if differing:
             raise ValueError(
                 f"instances of scenario {drawn.name!r} differ in their {', '.join(differing)}, and worlds of a batch "
@@ -188,11 +188,8 @@ class EnvSetup:
             )
         return drawn
 
-    def shares_world(self, problem: Problem) -> bool:
-        """Check whether a problem has the obstacles and the bounds of the first."""
-        return not self._differing(problem, _WORLD_ARRAYS)
-
-    def _differing(self, problem: Problem, names: Iterable[str]) -> list[str]:
+    def differing(self, problem: Problem, names: Iterable[str]) -> list[str]:
+        """Those arrays by ``names`` in which a problem is another than the first."""
         one, other = problem.arrays, self.problem.arrays
         return [name for name in names if not np.array_equal(getattr(one, name), getattr(other, name))]
 
@@ -227,7 +224,7 @@ class WorldProblems:
             if len(self.all) == 1:
                 self._disturbed.problem = problem
             else:
-                self.alike &= self._setup.shares_world(problem)
+                self.alike &= not self._setup.differing(problem, _WORLD_ARRAYS)
         worlds.start[world], worlds.goal[world] = problem.start, problem.goal
         worlds.inverse[world] = problem.arrays.inverse_initial_distance
 

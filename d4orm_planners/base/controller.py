@@ -26,13 +26,7 @@ from d4orm_planners.tracking.reference_feedback import (
     Reference,
     regulated,
 )
-from d4orm_planners.tracking.steering import (
-    advanced,
-    limited_states,
-    present_velocities,
-    track_velocities,
-    weaker,
-)
+from d4orm_planners.tracking.steering import advanced, limited_states, present_velocities, track_velocities, weaker
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
