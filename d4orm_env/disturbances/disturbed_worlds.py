@@ -129,8 +129,17 @@ class DisturbedWorlds:
             changed = _checked(one.disturbance.limits(limits), limits.shape, one, "limits")
             if one.foreign and (changed < SMALLEST).any():
                 raise one.wrong("limits", changed[changed < SMALLEST], f"numbers of at least {SMALLEST:g}")
-            limits = changed
+            limits = self._both_ways(limits, changed)
         return read_only(np.array(limits, np.float32))
+
+    def _both_ways(self, before: FloatArray, after: FloatArray) -> FloatArray:
+        """``(K, L)`` limits after a change; those of the other way, which it left as they were, change by as much."""
+        limits = after.copy()
+        for robot, model in enumerate(self.problem.team.robot_models):
+            for column, own in model.lower_limits:
+                if after[robot, own] == before[robot, own]:
+                    limits[robot, own] *= after[robot, column] / before[robot, column]
+        return limits
 
     def scene(
         self,

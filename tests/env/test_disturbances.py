@@ -25,6 +25,7 @@ from scipy import stats
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
 from d4orm_env.disturbances import (
     Bias,
     ControlNoise,
@@ -542,6 +543,15 @@ def test_limits_are_truly_lower_and_seen_as_before() -> None:
         assert split_state(problem, env.state()).controls[0, 0] == pytest.approx(0.6)
         assert seen["robot_0"][layout.own.max_speed] == 1
     assert seen["robot_0"][layout.own.speed] == pytest.approx(0.6, abs=1e-5)
+
+
+def test_robots_are_weaker_backwards_and_to_the_right_too() -> None:
+    own = {"max_reverse_speed": 0.5, "max_right_turn_rate": 0.5}
+    problem = line_problem([30.0], "unicycle1").replace(team=Team(("unicycle1",), max_turn_rate=1.0, own_limits=own))
+    env = navigation_v0.parallel_env(problem=problem, disturbances=[LimitMismatch(0.8)])
+    env.reset(seed=0)
+    env.step({"robot_0": np.array([-0.5, -0.5], np.float32)})
+    np.testing.assert_allclose(split_state(problem, env.state()).controls[0], -0.4)
 
 
 # Draws
