@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import LARGEST, FloatArray, frozen_per_robot, numbers_of, refuse_robots
 from d4orm_env.core.team import Team
+from d4orm_env.dynamics.robot_model import ACCELERATION
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
@@ -24,8 +25,14 @@ LEAST_TOLERANCE = 1e-3
 def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
     """``(K,)`` speeds at which robots may dock [m/s], given or what each brakes away in a time step ``dt`` [s]."""
     if given is None:
-        first_order = np.array([model.first_order for model in team.robot_models])
-        return np.where(first_order, np.float32(np.inf), team.max_acceleration * np.float32(dt))
+        speeds, step = team.max_acceleration * np.float32(dt), np.float32(dt)
+        for robot, model in enumerate(team.robot_models):
+            if model.first_order:
+                speeds[robot] = np.inf
+            elif any(column == ACCELERATION for _, column in model.state_limits):
+                # Its acceleration must end too, at the rate that its controls allow.
+                speeds[robot] = min(speeds[robot], team.limits[robot, model.control_limits[0]] * step * step / 2)
+        return speeds
     speeds = _one_or_each(given, "goal_speed", team.num_robots)
     right = (speeds >= 0) & ((speeds <= LARGEST) | (speeds == np.inf))
     refuse_robots(~right, "goal_speed", speeds, f"from 0 to {LARGEST:g}, or inf for no limit")

@@ -59,8 +59,8 @@ class Problem(Frozen):
         margin: Safety margin epsilon [m] that plans keep to everything, by default the team's.
         goal_radius: A robot within it has arrived [m].
         goal_speed: ``(K,)`` speed at which each robot may still dock [m/s]; one number is for all. By default what it
-            brakes away in a time step, ``max_acceleration * dt``, and infinite for first-order models. Infinite is the
-            paper's convention: robots stop dead at their goals, as no real one can.
+            brakes away in a time step: ``max_acceleration * dt``, ``max_jerk * dt**2 / 2`` where brakes act late, and
+            infinite for first-order models. Infinite is the paper's convention: robots stop dead at their goals.
         goal_heading: ``(K,)`` heading with which each robot must arrive [rad], NaN for any; one number is for all.
         goal_heading_tolerance: ``(K,)`` by how much it may be missed [rad], from 0.001 to pi.
         goal_hitches: ``(K, 3)`` hitch angles with which trailers must arrive, as exactly [rad]; NaN for any.

@@ -67,15 +67,21 @@ class Candidate:
         return (True, 0, self.reward) if self.solved else (False, -int(self.unsolved.sum()), self.reward)
 
 
-def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray, check_interval: int = 1) -> Candidate:
-    """Roll out and evaluate controls ``(H, K, m)``: failures at every ``check_interval``-th step, a solution at all."""
+def evaluate_controls(
+    engine: Engine, problem: Problem, controls: FloatArray, check_interval: int = 1, judged: bool = True
+) -> Candidate:
+    """Roll out and evaluate controls ``(H, K, m)``: failures at every ``check_interval``-th step, a solution at all.
+
+    If it is not ``judged`` what happens between steps does not count.
+    """
     bound = MOST_OF_LIMIT * problem.team.control_limits
     bounded = np.clip(controls, -bound, bound)
     trajectory = engine.rollout(problem, bounded)
     at_rest = trajectory.arrived[:-1, :, None] & problem.docks
     planned = np.where(at_rest, np.float32(0), bounded)
     failed = failed_robots(trajectory, check_interval)
-    report = None if failed_robots(trajectory).any() else verify(problem, trajectory.controls)
+    judge = verify if judged else _unjudged
+    report = None if failed_robots(trajectory).any() else judge(problem, trajectory.controls)
     return Candidate(planned, trajectory.controls, trajectory, failed, report)
 
 
@@ -87,6 +93,11 @@ def failed_robots(trajectory: Trajectory, check_interval: int = 1) -> BoolArray:
     violated = trajectory.margin_violated[check_interval::check_interval]
     failed: BoolArray = ~trajectory.arrived[-1] | violated.any(axis=0)
     return failed
+
+
+def _unjudged(problem: Problem, controls: FloatArray) -> VerificationReport:
+    unknown = np.full(problem.num_robots, np.nan)
+    return VerificationReport(np.nan, np.nan, unknown, unknown, True, [])
 
 
 def step_faults(problem: Problem, trajectory: Trajectory, unreachable: Set[int]) -> dict[int, list[str]]:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, positive_number, read_only, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
+from d4orm_env.disturbances.controls import Lag
 from d4orm_env.disturbances.disturbance import truth
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.disturbance_observer import DisturbanceObserver, check_lag
@@ -35,6 +36,8 @@ Mode = Literal["nominal", "measured"]
 
 SAME_PERIOD = 0.5
 """Share of a period within which another call gets the same setpoint."""
+LATE = 0.25
+"""Share of a period by which a late step's successors may come earlier than a period after it."""
 IN_TIME = 0.9
 """Share of a step's timeout that is a policy's deadline."""
 
@@ -186,13 +189,20 @@ class Controller:
         if abs(passed) >= SAME_PERIOD:
             self._setpoint = self._advance(measured, known)
             # Periods follow each other, so that frequent calls do not make the reference faster than the clock.
-            self._time = float(time) if passed < 0 else max(self._time + dt, float(time) - SAME_PERIOD * dt)
+            self._time = float(time) if passed < 0 else max(self._time + dt, float(time) - LATE * dt)
             self.clock_resets += passed < 0
         return self._setpoint
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
-        """Take over the team of an environment: controllers are policies, for :func:`~d4orm_planners.run_episode`."""
+        """Take over the team of an environment: controllers are policies, for :func:`~d4orm_planners.run_episode`.
+
+        Where the team has a lag, it is that of the environment here: of its ``Lag``, or none.
+        """
         problem: Problem = env.unwrapped.problem
+        if problem.team.lag.any():
+            lag = sum(one.time_constant for one in env.unwrapped.options.disturbances if isinstance(one, Lag))
+            team = problem.team.replace(lag=np.where(problem.team.lag > 0, lag, 0.0))
+            problem = problem.with_state(problem.start, problem.goal, team=team)
         self.begin(problem, split_state(problem, env.state()).states, seed=seed)
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:

@@ -82,6 +82,7 @@ class SolveRun:
         evaluate: Function that makes a candidate of an iteration's controls, if not :func:`evaluate_controls`.
         check_interval: Number of steps between checks for failures (paper, section VI-A); a solution keeps the margin
             at all steps.
+        judged: Whether a solution must pass :func:`d4orm_env.verify` too.
 
     Attributes:
         watch: Time used.
@@ -105,6 +106,7 @@ class SolveRun:
         engine: SamplingEngine | None = None,
         evaluate: Callable[[FloatArray], Candidate] | None = None,
         check_interval: int = 1,
+        judged: bool = True,
     ) -> None:
         self.planner = planner
         self.problem = problem
@@ -124,7 +126,9 @@ class SolveRun:
             self.engine.rollout(problem, controls)
         # A shorter plan is checked at its end.
         self.check_interval = min(check_interval, problem.horizon)
-        of_controls = partial(evaluate_controls, self.engine, problem, check_interval=self.check_interval)
+        of_controls = partial(
+            evaluate_controls, self.engine, problem, check_interval=self.check_interval, judged=judged
+        )
         self.current = self.best = of_controls(controls)
         self._evaluate = evaluate or of_controls
         self.iteration = self.denoising_steps = 0

@@ -202,10 +202,12 @@ class CoarsePlanning:
 
     Attributes:
         planner: Planner of the coarse plans.
+        judged: Whether these must pass ``verify()``: of cars it takes most of the time, in Python, which delays loops.
     """
 
     def __init__(self, config: D4ormC2FConfig, seed: int, last_step: int | None) -> None:
         self._config, self._seed, self._last_step = config, seed, last_step
+        self.judged = config.deadline is None
         # Fine plans cannot keep to paths that fit between others to the centimetre. But where the team is stuck there
         # may be no others.
         self.planner, self._thorough = (_coarse_planner(config, reroute=reroute) for reroute in (False, True))
@@ -255,7 +257,7 @@ class CoarsePlanning:
     ) -> tuple[Candidate, CoarsePlan]:
         """The first plan that passes the checks, or the best one."""
         start = None if initial is None else initial[: coarse.horizon]
-        search = SolveRun(planner, coarse, seed, start, check_interval=self._config.check_interval)
+        search = SolveRun(planner, coarse, seed, start, check_interval=self._config.check_interval, judged=self.judged)
         chosen, ordered = search.current, False
         for number in range(iterations):
             if not chosen.failed.any():

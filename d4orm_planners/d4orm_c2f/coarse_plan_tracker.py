@@ -257,7 +257,7 @@ class CoarsePlanTracker:
     def _refined(self, guidance: CoarsePlan, index: int, seed: int) -> CoarsePlan:
         """The guidance, improved from a waypoint on if that succeeds (line 4)."""
         left, controls = rest_of(guidance, index, self._config.coarse_factor)
-        search = SolveRun(self._planning.planner, left, seed, controls)
+        search = SolveRun(self._planning.planner, left, seed, controls, judged=self._planning.judged)
         search.advance()
         done = guidance.problem.horizon - left.horizon
         before, after = guidance.states[: done + 1], search.best.trajectory

@@ -374,14 +374,16 @@ def test_the_arrays_that_engines_read() -> None:
 
 
 def test_robots_arrive_at_what_they_brake_away_in_a_step() -> None:
-    team = Team(("holonomic2d", "velocity2d", "differential_drive", "car"), max_acceleration=[1, 1, 2, 0.5])
-    start = np.zeros((4, team.state_size))
-    start[:, 0] = np.arange(4)
+    models = ("holonomic2d", "velocity2d", "differential_drive", "car", "holonomic2d_jerk")
+    team = Team(models, max_acceleration=[1, 1, 2, 0.5, 1])
+    start = np.zeros((5, team.state_size))
+    start[:, 0] = np.arange(5)
     problem = Problem(team, start, start[:, :2] + [0, 2], dt=0.2)
-    np.testing.assert_allclose(problem.goal_speed, [0.2, np.inf, 0.4, 0.1], rtol=1e-6)
+    # The last one's jerk is 4 m/s^3: it comes to rest as its acceleration does.
+    np.testing.assert_allclose(problem.goal_speed, [0.2, np.inf, 0.4, 0.1, 0.08], rtol=1e-6)
     assert problem.select([2, 0]).goal_speed.tolist() == problem.goal_speed[[2, 0]].tolist()
-    assert problem.replace(goal_speed=np.inf).goal_speed.tolist() == [np.inf] * 4
-    assert problem.replace(goal_speed=[0, 1, 2, np.inf]).goal_speed.tolist() == [0, 1, 2, np.inf]
+    assert problem.replace(goal_speed=np.inf).goal_speed.tolist() == [np.inf] * 5
+    assert problem.replace(goal_speed=[0, 1, 2, np.inf, 3]).goal_speed.tolist() == [0, 1, 2, np.inf, 3]
 
 
 CHANGES: list[dict[str, Any]] = [

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from d4orm_env import Problem, Team, load_problem, make_problem, make_team, save_problem
+from d4orm_env import Problem, Team, load_problem, make_problem, make_team, navigation_v0, save_problem
 from d4orm_env.core.robot_types import ROBOTS
+from d4orm_env.disturbances import Lag
 from d4orm_env.footprints import Ellipsoid
 from d4orm_planners import Controller, make_planner
 
@@ -76,6 +77,15 @@ def test_controllers_take_the_lag_of_the_team(mode: Any, tracker: bool) -> None:
         controller.begin(problem, problem.start)
         np.testing.assert_allclose(controller.lag, lag)
         assert controller.step(problem.start, 0.0).control.shape == problem.arrays.start[:, :2].shape
+
+
+@pytest.mark.parametrize(("disturbances", "lag"), [((), 0.0), ((Lag(0.1), Lag(0.2)), 0.3)])
+def test_controllers_in_an_environment_take_its_lag(disturbances: Any, lag: float) -> None:
+    controller = Controller("go-to-goal")
+    env = navigation_v0.parallel_env("circle", 2, robot="turtlebot3_burger", disturbances=disturbances)
+    env.reset(seed=0)
+    controller.reset(env)
+    np.testing.assert_allclose(controller.lag, lag)
 
 
 def test_drones_leave_room_for_their_downwash_where_they_are_told_to() -> None:

@@ -24,6 +24,7 @@ from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
+from d4orm_planners.base import candidate
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.policy_threads import Background
 from d4orm_planners.d4orm_c2f import fine_plan
@@ -325,6 +326,16 @@ def test_no_loop_waits_for_a_new_coarse_plan(monkeypatch: pytest.MonkeyPatch) ->
     assert policy.loops[-1].replanned
 
 
+@pytest.mark.parametrize(("deadline", "judged"), [(None, True), (60.0, False)])
+def test_coarse_plans_are_not_judged_in_real_time(
+    deadline: float | None, judged: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reports: list[Any] = []
+    monkeypatch.setattr(candidate, "verify", lambda *plan: reports.append(verify(*plan)) or reports[-1])
+    assert episode(controller(deadline=deadline), circle(4)).metrics["success"]
+    assert bool(reports) == judged
+
+
 def test_ample_deadlines_change_nothing() -> None:
     problem = circle(4)
     waiting, pressed = (episode(controller(deadline=deadline), problem) for deadline in (None, 60.0))
@@ -425,6 +436,14 @@ def test_refinement_yields_to_the_control_loop_and_takes_no_priority(
         background.start(lambda: None)
         background.forget()
     assert asked == [refining]
+
+
+def test_work_that_yields_lets_go_of_the_interpreter_more_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[float] = []
+    monkeypatch.setattr(sys, "setswitchinterval", told.append)
+    for before, after in ((5e-3, 5e-4), (1e-4, 1e-4)):
+        monkeypatch.setattr(sys, "getswitchinterval", lambda before=before: before)
+        assert Background(yielding=True).start(lambda: told[-1]).result() == after
 
 
 def test_work_that_yields_leaves_other_cores_to_the_control_loop() -> None:
