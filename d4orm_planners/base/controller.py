@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, positive_number, read_only, short_repr
+from d4orm_env.core.arrays import (
+    BoolArray,
+    FloatArray,
+    Floats,
+    frozen_per_robot,
+    positive_number,
+    read_only,
+    refuse_robots,
+    short_repr,
+)
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.disturbances.controls import Lag
@@ -16,7 +26,7 @@ from d4orm_env.disturbances.disturbance import truth
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.disturbance_observer import DisturbanceObserver, check_lag
 from d4orm_planners.base.episode import open_env
-from d4orm_planners.base.measured_states import completed, seconds
+from d4orm_planners.base.measured_states import brought_up, completed, seconds
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
 from d4orm_planners.base.policy import Actions, Observations, OpenLoop, Policy, robot_indices
 from d4orm_planners.base.policy_threads import Background, check_episode
@@ -36,6 +46,8 @@ Mode = Literal["nominal", "measured"]
 
 SAME_PERIOD = 0.5
 """Share of a period within which another call gets the same setpoint."""
+OLDEST = 10
+"""Age of a measured state at most, in periods."""
 LATE = 0.25
 """Share of a period by which a late step's successors may come earlier than a period after it."""
 IN_TIME = 0.9
@@ -155,6 +167,7 @@ class Controller:
             observer.go_on_from(self._observer)
             lead = self._lead
         self._observer, self._lead, self._robots = observer, lead, problem
+        self._driven: deque[FloatArray] = deque(maxlen=OLDEST)
         self._open(problem, seed)
         space, shape = self._env.state_space, problem.start.shape
         self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
@@ -169,28 +182,34 @@ class Controller:
         idle = self._joint.controls
         self._setpoint = self._described(Reference(start, start, idle, idle), held=False)
 
-    def step(self, states: ArrayLike, time: float) -> ControlSetpoint:
+    def step(self, states: ArrayLike, time: float, age: ArrayLike = 0.0) -> ControlSetpoint:
         """Return the setpoint for the period that begins now.
 
         Called more often than once every ``problem.dt`` it returns the same one again.
 
         Args:
             states: ``(K, n)`` measured states, NaN for what is missing.
-            time: Of the measurement [s].
+            time: Now [s].
+            age: How long ago they were measured [s], one or ``(K,)``, at most :data:`OLDEST` periods: robots are taken
+                to have gone on since, as what they were told has it.
 
         Raises:
             RuntimeError: Before :meth:`begin`.
-            ValueError: If the states have another shape, or the time is no number of seconds.
+            ValueError: If the states have another shape, the time is no number of seconds, or one is too old.
         """
-        reference = self._joint.states
+        reference, dt = self._joint.states, self.problem.dt
         measured, known = completed(self.problem, self._bounds, states, reference, self._expected)
-        dt = self.problem.dt
+        ages = frozen_per_robot(age, "age", len(known), zero_allowed=True)
+        refuse_robots(ages > OLDEST * dt, "age", ages, f"at most {OLDEST} periods; give NaN for what is older", " s")
+        ages = np.where(known & ~(self.arrived & self.problem.docks), ages, np.float32(0))
+        measured = brought_up(self._robots, measured, self._driven, ages)
         passed = (seconds(time) - self._time) / dt
         if abs(passed) >= SAME_PERIOD:
             self._setpoint = self._advance(measured, known)
             # Periods follow each other, so that frequent calls do not make the reference faster than the clock.
             self._time = float(time) if passed < 0 else max(self._time + dt, float(time) - LATE * dt)
             self.clock_resets += passed < 0
+            self._driven.append(self._observer.driven)
         return self._setpoint
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:

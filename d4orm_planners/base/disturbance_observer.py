@@ -100,15 +100,20 @@ class DisturbanceObserver:
             self._set_lag(self._finder.constants)
             self.applied = self._finder.applied
 
+    @property
+    def driven(self) -> FloatArray:
+        """``(K, m)`` controls without a lag or disturbance that do as robots do now."""
+        driven = self.applied.copy()
+        driven[:, : self.problem.dimension] += self.bias
+        return driven.astype(np.float32)
+
     def undelayed(self, states: FloatArray, known: BoolArray) -> FloatArray:
         """``(K, n)`` states that obey the models as if there were no lag; those of robots that are not ``known``
         ``(K,)`` as they are.
 
         With a lag ``tau`` these are ``x + tau dx/dt``: where models are linear they move as the control itself has it.
         """
-        driven = self.applied.copy()
-        driven[:, : self.problem.dimension] += self.bias
-        lag, rate = np.where(known, self.lag.constants, 0.0), rates(self.problem, states, driven.astype(np.float32))
+        lag, rate = np.where(known, self.lag.constants, 0.0), rates(self.problem, states, self.driven)
         return states + (lag[:, None] * rate).astype(np.float32)
 
     def shifted(self, lead: Floats, reference: FloatArray, states: FloatArray, known: BoolArray) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from numbers import Real
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, frozen_array, numbers_of, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.winding import MAX_ANGLE
-from d4orm_planners.tracking.steering import by_model
+from d4orm_planners.tracking.steering import advanced, by_model, short_way_round
 
 BEYOND = 4
 """Distance beyond the state space at which measured numbers are cut off, in sizes of the space."""
@@ -31,6 +31,18 @@ def seconds(time: object) -> float:
             if abs(value := float(time)) <= LATEST:
                 return value
     raise ValueError(f"time is {short_repr(time)}; give the seconds of one clock")
+
+
+def brought_up(problem: Problem, states: FloatArray, driven: Sequence[FloatArray], ages: FloatArray) -> FloatArray:
+    """``(K, n)`` states after their ages ``(K,)`` [s], as the models have it: by what robots were ``driven`` by
+    ``(K, m)`` in the last periods, at rest before.
+    """
+    steps = ages[:, None] / np.float32(problem.dt)
+    for back in range(int(np.ceil(steps.max())), 0, -1):
+        controls = driven[-back] if back <= len(driven) else np.zeros((len(ages), problem.control_size), np.float32)
+        moved = short_way_round(problem, advanced(problem, states, controls) - states)
+        states = states + np.clip(steps - (back - 1), 0, 1) * moved
+    return states
 
 
 @cache

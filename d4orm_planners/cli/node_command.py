@@ -18,6 +18,7 @@ from d4orm_env.core.arrays import duration, whole_number
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.files import read_yaml
 from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.disturbance import truth
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.schema import VERSION, parse
 from d4orm_planners.base.controller import Controller
@@ -186,7 +187,19 @@ def _events_as_lines() -> Iterator[None]:
         logger.removeHandler(handler)
 
 
-FIELDS = ("problem", "policy", "settings", "controller", "robots", "deadline", "domain", "seed", "zenoh", "wire")
+FIELDS = (
+    "problem",
+    "policy",
+    "settings",
+    "controller",
+    "robots",
+    "deadline",
+    "domain",
+    "seed",
+    "zenoh",
+    "wire",
+    "stamps",
+)
 CONTROLLER = {"mode", "reserve", "timeout", "lag", "tracker"}
 """Settings of the controller."""
 SHARE = 0.9
@@ -205,6 +218,7 @@ class ServeTask:
     seed: int
     zenoh: ZenohSettings
     wire: str
+    stamps: bool
 
 
 def serve(
@@ -214,7 +228,7 @@ def serve(
     task, over = read_task(config, FIELDS[:1], FIELDS[1:], _serve_task), threading.Event()
     # Robots are told to stand once it is set.
     with on_signals(lambda *_: over.set()), RosSession(task.zenoh, task.domain, NODE, task.wire) as session:
-        server = FleetServer(session, task.problem, task.controller, task.names, task.deadline, task.seed)
+        server = FleetServer(session, task.problem, task.controller, task.names, task.deadline, task.seed, task.stamps)
         typer.echo(f"serving {', '.join(task.names)} on domain {task.domain}; Ctrl-C ends it")
         server.run(over)
 
@@ -248,4 +262,5 @@ def _serve_task(fields: Mapping[str, Any], folder: Path) -> ServeTask:
         seed=whole_number(fields.get("seed", 0), "seed", 0),
         zenoh=ZenohSettings.of(zenoh),
         wire=wire,
+        stamps=truth(fields.get("stamps", False), "stamps"),
     )

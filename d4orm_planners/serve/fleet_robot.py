@@ -19,6 +19,7 @@ class FleetRobot:
     name: str  #: Name of its topics
     state: FloatArray  #: ``(n,)`` as last heard; not a number before, and what no message says
     heard: float = -np.inf  #: When it was last heard, by this process's clock [s]
+    measured: float = -np.inf  #: When that was, likewise; as it was heard, if no stamps tell [s]
     heading: float = 0.0  #: As last heard [rad]
     yaw: float = 0.0  #: As first heard, which a robot whose model has no heading keeps [rad]
     stand: Floats | None = None  #: ``(d,)`` where it is held, or braking to a halt, while the team does not drive [m]

@@ -11,7 +11,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, positive_number
 from d4orm_env.core.problem import Problem
-from d4orm_planners.base.controller import Controller
+from d4orm_planners.base.controller import OLDEST, Controller
 from d4orm_planners.serve import wire
 from d4orm_planners.serve.fleet_robot import FleetRobot
 from d4orm_planners.serve.wire import RosSession, Subscriber, position_of, turned
@@ -62,6 +62,8 @@ class FleetServer:
         names: Of the robots, in the problem's order.
         deadline: Longest silence of a robot [s].
         seed: Of the controller.
+        stamped: Whether robots' clocks are this machine's: states are as old as their stamps say then, and those older
+            than the deadline are not taken. Else they are of the moment in which they are read.
 
     Attributes:
         state: What it does.
@@ -77,13 +79,14 @@ class FleetServer:
         names: tuple[str, ...],
         deadline: float = 0.5,
         seed: int = 0,
+        stamped: bool = False,
     ) -> None:
         if len(names) != problem.num_robots:
             raise ValueError(f"there are {len(names)} names for {problem.num_robots} robots; give one for each")
         if len(set(names)) < len(names):
             raise ValueError(f"robots are called {', '.join(names)}; give each a name of its own")
         self.deadline = positive_number(deadline, "deadline", least=problem.dt)
-        self._problem, self._controller, self._seed = problem, controller, seed
+        self._problem, self._controller, self._seed, self._stamped = problem, controller, seed, stamped
         self._robots = [FleetRobot(name, np.full(problem.state_size, np.nan, np.float32)) for name in names]
         self._odometry = [session.subscriber(f"{name}/odom", wire.ODOMETRY) for name in names]
         self._poses = [session.subscriber(f"{name}/pose", wire.POSE) for name in names]
@@ -158,12 +161,12 @@ class FleetServer:
         for number, robot in enumerate(self._robots):
             for message in self._odometry[number].take():
                 told = message.twist.twist
-                self._hear(number, message.pose.pose, now, position_of(told.linear), told.angular.z)
+                self._hear(number, message.pose.pose, now, message.header, position_of(told.linear), told.angular.z)
             for message in self._poses[number].take():
                 if np.isfinite(position_of(message.pose.position)).all():
                     robot.take_pose(message, now, BASE * self._problem.dt, self.deadline)
                     own = turned(robot.velocity, -wire.heading_of(message.pose.orientation))
-                    self._hear(number, message.pose, now, own)
+                    self._hear(number, message.pose, now, message.header, own)
             for message in self._goals[number].take():
                 self._wanted[number] = position_of(message.pose.position)[: self._problem.dimension], now
         self._take_goals(now)
@@ -178,12 +181,15 @@ class FleetServer:
                     self._replan, self._pace, self._stops = True, 0.0, self._stops + 1
                     self._stand()
 
-    def _hear(self, number: int, pose: Any, now: float, velocity: Floats, turn_rate: float = np.nan) -> None:
+    def _hear(
+        self, number: int, pose: Any, now: float, header: Any, velocity: Floats, turn_rate: float = np.nan
+    ) -> None:
+        age = max(time.time() - wire.time_of(header), 0.0) if self._stamped else 0.0
         state, robot = wire.state_from(self._problem, number, pose, velocity, turn_rate), self._robots[number]
         heading = wire.heading_of(pose.orientation)
-        if np.isfinite(heading) and np.isfinite(state[: self._problem.dimension]).all():
+        if np.isfinite(heading) and np.isfinite(state[: self._problem.dimension]).all() and age <= self.deadline:
             robot.yaw = robot.yaw if np.isfinite(robot.heard) else heading
-            robot.state, robot.heading, robot.heard = state, heading, now
+            robot.state, robot.heading, robot.heard, robot.measured = state, heading, now, now - age
         else:
             self._unusable += 1
 
@@ -220,7 +226,8 @@ class FleetServer:
         return bool((fast & (now - self._stopped < team.max_speed / team.max_acceleration)).any())
 
     def _next_period(self, states: FloatArray, now: float) -> Period:
-        setpoint = self._controller.step(states, now)
+        ages = [min(now - robot.measured, OLDEST * self._problem.dt) for robot in self._robots]
+        setpoint = self._controller.step(states, now, ages)
         lags = self._controller.lag * np.isfinite(states[:, 0])  # a reference has none
         headings = [robot.heading for robot in self._robots]
         rows = zip(self._controller.states, setpoint.control, headings, self._twists, lags)

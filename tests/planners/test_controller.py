@@ -276,6 +276,30 @@ def test_what_no_sensor_says_follows_from_states_and_controls(model: str, unmeas
         states = advanced(problem, states, told.control)
 
 
+@pytest.mark.parametrize("mode", ["nominal", "measured"])
+def test_robots_that_are_seen_late_drive_as_if_they_were_seen_now(mode: Any) -> None:
+    problem, told = team("holonomic2d", 2), []
+    for late in ([0, 0], [1, 3]):
+        with Controller("go-to-goal", mode=mode) as controller:
+            controller.begin(problem, problem.start)
+            seen, states, said = [], problem.start + np.float32([0.1, 0.1, 0, 0]), []
+            for step in range(30):
+                seen.append(states)
+                old = np.minimum(late, step)
+                measured = np.stack([seen[step - steps][robot] for robot, steps in enumerate(old)])
+                setpoint = controller.step(measured, step * problem.dt, old * problem.dt)
+                states = advanced(problem, states, setpoint.control)
+                said.append(setpoint.control)
+        told.append(said)
+    np.testing.assert_allclose(*told, atol=2e-3)
+    for age, message in (
+        (-0.1, "age of robot_0 is -0.1"),
+        ([0, 1.1], "age of robot_1 is 1.1 s; it must be at most 10"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            controller.step(states, 9.0, age)
+
+
 def test_one_setpoint_a_period_and_none_skipped() -> None:
     problem = team("holonomic2d", 2)
     controller = Controller("go-to-goal")

@@ -251,6 +251,28 @@ class Memory:
             self.heard[topic]()
 
 
+def test_stamps_tell_how_old_states_are_where_clocks_are_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    session, ages = Memory(), []
+    names = tuple(f"robot_{number}" for number in range(problem().num_robots))
+    monkeypatch.setattr(time, "time", lambda: 1000.0)
+    with Controller("go-to-goal", mode="measured") as controller:
+        step = controller.step
+        monkeypatch.setattr(controller, "step", lambda *told: ages.append(told[2]) or step(*told))
+        server = FleetServer(session, problem(), controller, names, DEADLINE, stamped=True)  # type: ignore[arg-type]
+
+        def tick(old: float = 0.2) -> None:
+            for name, state in zip(names, problem().start, strict=True):
+                odometry = odometry_of(state[:2])
+                odometry.header.stamp.sec, odometry.header.stamp.nanosec = 999, round(1e9 * (1 - old))
+                session.say(f"{name}/odom", odometry)
+            server.tick(time.monotonic())
+
+        tick(DEADLINE + 0.01)
+        assert server.state == "waiting"
+        planned(tick, server)
+    np.testing.assert_allclose(ages[-1], 0.2, atol=1e-6)
+
+
 def planned(tick: Callable[[], object], server: FleetServer) -> None:
     """Tick until the robots drive: a thread plans, and kernels may have to be compiled for it."""
     end = time.monotonic() + 600
