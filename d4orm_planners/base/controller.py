@@ -201,8 +201,7 @@ class Controller:
         measured, known = completed(self.problem, self._bounds, states, reference, self._expected)
         ages = frozen_per_robot(age, "age", len(known), zero_allowed=True)
         refuse_robots(ages > OLDEST * dt, "age", ages, f"at most {OLDEST} periods; give NaN for what is older", " s")
-        ages = np.where(known & ~(self.arrived & self.problem.docks), ages, np.float32(0))
-        measured = brought_up(self._robots, measured, self._driven, ages)
+        measured = brought_up(self._robots, measured, self._driven, np.where(known, ages, np.float32(0)))
         passed = (seconds(time) - self._time) / dt
         if abs(passed) >= SAME_PERIOD:
             self._setpoint = self._advance(measured, known)
