@@ -255,6 +255,13 @@ def whole_number(value: object, name: str, minimum: int, maximum: int | None = N
     return int(value)
 
 
+def truth(value: object, name: str) -> bool:
+    """True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} is {short_repr(value)}; it must be True or False")
+    return bool(value)
+
+
 def plain_number(value: object) -> object:
     """A number or truth value of NumPy's as Python's, else a TypeError: ``default=`` of ``json.dumps``."""
     for theirs, ours in ((np.bool_, bool), (np.integer, int), (np.floating, float)):

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from d4orm_env.core.arrays import whole_number
+from d4orm_env.core.arrays import truth, whole_number
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.team import Team
 from d4orm_env.footprints import Ellipsoid
@@ -39,9 +39,7 @@ class RobotType:
 
     def settings(self, downwash: object = False) -> dict[str, object]:
         """Arguments of scenarios for a team of these, as balls or with room for their downwash."""
-        if not isinstance(downwash, bool):
-            raise ValueError(f"downwash is {downwash!r}; it must be True or False")
-        if downwash and not self.downwash:
+        if truth(downwash, "downwash") and not self.downwash:
             raise ValueError("downwash is True, and this robot has none; leave it out, or choose a drone as robot")
         names = ("model", "max_speed", "max_acceleration", "max_turn_rate", "margin", "lag")
         size = (

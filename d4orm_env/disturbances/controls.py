@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, positive_number, short_repr, whole_number
+from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, positive_number, short_repr, truth, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import (
     MAX_DELAY,
@@ -27,7 +27,6 @@ from d4orm_env.disturbances.disturbance import (
     scaled,
     share,
     standard_deviation,
-    truth,
 )
 from d4orm_env.disturbances.draws import Draws
 

@@ -247,13 +247,6 @@ def unless(special: object, check: Check) -> Check:
     return lambda value, name: value if value is special or value == special else check(value, name)
 
 
-def truth(value: object, name: str) -> bool:
-    """True or False."""
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} is {short_repr(value)}; it must be True or False")
-    return bool(value)
-
-
 def per_component(value: ArrayLike, name: str) -> float | tuple[float, ...]:
     """One number, or one per control component, of zero or more."""
     array = numbers_of(value, f"{name} must be a number or one per control component")

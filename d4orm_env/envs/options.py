@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import short_repr
+from d4orm_env.core.arrays import short_repr, truth
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
@@ -150,8 +150,7 @@ class EnvOptions:
         if self.progress not in ("straight", "path"):
             raise ValueError(f"progress is {short_repr(self.progress)}; it must be 'straight' or 'path'")
         for name in ("observed_path", "line_of_sight", "egocentric"):
-            if not isinstance(value := getattr(self, name), bool):
-                raise ValueError(f"{name} is {short_repr(value)}; it must be True or False")
+            truth(getattr(self, name), name)
         if not (isinstance(self.lifelong, bool) or callable(self.lifelong)):
             raise ValueError(
                 f"lifelong is {short_repr(self.lifelong)}; it must be True or False, or a function that gives goals"

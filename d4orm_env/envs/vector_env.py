@@ -11,9 +11,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
+from d4orm_env.core.arrays import BoolArray, FloatArray, truth, whole_number
 from d4orm_env.core.observation_layout import ObservationLayout
-from d4orm_env.disturbances.disturbance import truth
 from d4orm_env.engine.types import LOOK, SKIP
 from d4orm_env.envs.inputs import checked_autoreset_mode, joint_controls, reset_mask, world_seeds
 from d4orm_env.envs.joint_env import joint_spaces

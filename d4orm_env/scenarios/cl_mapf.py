@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import number_list, positive_number, short_repr
+from d4orm_env.core.arrays import number_list, positive_number, truth
 from d4orm_env.core.errors import did_you_mean, first_line, unknown
 from d4orm_env.core.files import checked_path, naming, read_yaml
 from d4orm_env.core.problem import Problem
@@ -61,8 +61,7 @@ def load_cl_mapf(
     for name in given:
         if name not in VEHICLE:
             raise unknown("vehicle's entry", name, VEHICLE)
-    if not isinstance(clockwise, bool):
-        raise ValueError(f"clockwise is {short_repr(clockwise)}; it must be True or False")
+    clockwise = truth(clockwise, "clockwise")
     own = VEHICLE | {name: positive_number(value, f"{name} of vehicle") for name, value in given.items()}
     path = checked_path(path, "a problem of CL-CBS or CSDO")
     with naming(path):

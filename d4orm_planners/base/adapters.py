@@ -11,9 +11,8 @@ from typing import Any, TypeAlias
 
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, short_repr
+from d4orm_env.core.arrays import FloatArray, short_repr, truth
 from d4orm_env.core.lazy import LazyModule
-from d4orm_env.disturbances.disturbance import truth
 from d4orm_planners.base.shared_policy import Model, SharedPolicy, loaded
 
 tensordict: Any = LazyModule("tensordict")

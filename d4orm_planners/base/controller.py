@@ -18,11 +18,11 @@ from d4orm_env.core.arrays import (
     read_only,
     refuse_robots,
     short_repr,
+    truth,
 )
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.disturbances.controls import Lag
-from d4orm_env.disturbances.disturbance import truth
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.disturbance_observer import DisturbanceObserver, check_lag
 from d4orm_planners.base.episode import open_env

@@ -11,8 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, as_float32, short_repr
-from d4orm_env.disturbances.disturbance import truth
+from d4orm_env.core.arrays import FloatArray, as_float32, short_repr, truth
 from d4orm_env.envs.features import Features
 from d4orm_env.envs.joint_state import split_state
 from d4orm_planners.base.measured_states import acting_robots, stacked_observations

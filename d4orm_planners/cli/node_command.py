@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from d4orm_env.core.arrays import duration, whole_number
+from d4orm_env.core.arrays import duration, truth, whole_number
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.files import read_yaml
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import truth
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.schema import VERSION, parse
 from d4orm_planners.base.controller import Controller
