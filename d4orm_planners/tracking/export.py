@@ -166,8 +166,7 @@ class ExportReport:
     deviation: float  #: Largest distance from the plan at its steps [m]
     min_separation: float  #: Least gap between two robots [m]
     min_clearance: float  #: Least gap to an obstacle or bound [m]
-    #: Least height of a robot above another that it flies over, within both radii and the margin in the plane [m];
-    #: infinite where none does, or the team moves in the plane
+    #: Least height of a robot above another that it flies over [m]; infinite where none does, or in the plane
     min_overhead: float
     heights: tuple[float, float]  #: Lowest and highest z of any robot [m]
     pieces: int | None = None  #: Polynomials a robot, or ``None``

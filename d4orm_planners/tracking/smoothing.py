@@ -199,15 +199,15 @@ def verify_motion(
 
 
 def least_overhead(problem: Problem, positions: Floats) -> float:
-    """Least height of a robot above another, of positions ``(T, K, d)``, where both radii and the margin meet in the
-    plane [m]; infinite where none do, or the team moves in the plane.
+    """Least height of a robot above another, of positions ``(T, K, d)``, where both overlap seen from above [m];
+    infinite where none do, or the team moves in the plane. Who passes beside another is not above it.
     """
     least, radius = np.inf, problem.team.radius.astype(np.float64)
     if problem.dimension == 2:
         return least
     for robot in range(1, problem.num_robots):
         gaps = np.abs(positions[:, :robot] - positions[:, robot, None])
-        overlaps = np.hypot(gaps[..., 0], gaps[..., 1]) <= radius[:robot] + radius[robot] + problem.margin
+        overlaps = np.hypot(gaps[..., 0], gaps[..., 1]) <= radius[:robot] + radius[robot]
         least = min(least, float(gaps[..., 2][overlaps].min(initial=np.inf)))
     return least
 

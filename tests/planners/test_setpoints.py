@@ -458,9 +458,9 @@ def test_nobody_is_sent_into_the_floor(tmp_path: Path) -> None:
 
 
 def test_how_low_one_flies_over_another_is_told(tmp_path: Path) -> None:
-    # robot_1 crosses 1 m above robot_0, robot_2 passes 1 m beside it at half of that.
-    start = [[0, 0, 0, 0, 0, 0], [-1, 0, 1, 0, 0, 0], [-1, 1, 0.5, 0, 0, 0]]
-    problem = Problem(Team(("holonomic3d",) * 3), start, [[0, 0, 0], [1, 0, 1], [1, 1, 0.5]])
+    # robot_1 crosses 1 m above robot_0, robot_2 passes just beside it at half of that.
+    start = [[0, 0, 0, 0, 0, 0], [-1, 0, 1, 0, 0, 0], [-1, 0.33, 0.5, 0, 0, 0]]
+    problem = Problem(Team(("holonomic3d",) * 3), start, [[0, 0, 0], [1, 0, 1], [1, 0.33, 0.5]])
     plan = make_planner(engine="cpu").solve(problem, seed=0)
     assert plan.export("csv", tmp_path / "out").min_overhead == pytest.approx(1, abs=0.05)
 
