@@ -65,6 +65,12 @@ def safe_velocities(
     return (velocities * (speed / np.maximum(pace, speed))).astype(np.float32)
 
 
+def prepare_barriers() -> None:
+    """Compile what velocities are found by, if it is not yet."""
+    none = np.zeros(0, np.int64)
+    find_nearest(none, none, np.zeros((0, 2)), np.zeros(0), np.zeros((1, 2)), EXACT)
+
+
 class Barriers(NamedTuple):
     """``normals @ (v_one - v_other) >= least`` for velocities; -1 is no robot, and at rest."""
 

@@ -17,7 +17,7 @@ from d4orm_planners.base.planner_registry import find_policy
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.policy_threads import Background
 from d4orm_planners.base.settings import CheckedSettings
-from d4orm_planners.d4orm_c2f.barrier import safe_velocities
+from d4orm_planners.d4orm_c2f.barrier import prepare_barriers, safe_velocities
 from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlan, CoarseWaypoints
 from d4orm_planners.d4orm_c2f.coarse_plan_tracker import CoarsePlanTracker
 from d4orm_planners.d4orm_c2f.deviation import Deviation
@@ -102,6 +102,7 @@ class D4ormC2F(StatePolicy):
         lifelong = env.unwrapped.lifelong
         self._window = Window(self.problem, self.config, self._engine, docks=not lifelong)
         self._window.prepare(joint)
+        prepare_barriers()
         self._plan, self._next = self._window.no_controls(), 0
         self.subgoals: FloatArray = joint.states[:, : self.problem.dimension]
         self.predicted: FloatArray = self.subgoals[None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import threading
 import time
@@ -436,6 +437,19 @@ def test_refinement_yields_to_the_control_loop_and_takes_no_priority(
         background.start(lambda: None)
         background.forget()
     assert asked == [refining]
+
+
+def test_no_control_loop_has_to_compile_its_last_resort() -> None:
+    script = """if True:
+        from d4orm_env import navigation_v0
+        from d4orm_planners import make_policy
+        from d4orm_planners.d4orm_c2f.barrier import find_nearest
+        env = navigation_v0.parallel_env("circle", num_robots=2)
+        env.reset(seed=0)
+        make_policy("d4orm-c2f", engine="cpu").reset(env)
+        assert len(find_nearest.signatures) == 1
+    """
+    assert subprocess.run([sys.executable, "-c", script]).returncode == 0
 
 
 def test_work_that_yields_lets_go_of_the_interpreter_more_often(monkeypatch: pytest.MonkeyPatch) -> None:
