@@ -9,24 +9,13 @@ from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import (
-    BoolArray,
-    FloatArray,
-    Floats,
-    frozen_per_robot,
-    positive_number,
-    read_only,
-    refuse_robots,
-    short_repr,
-    truth,
-)
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, positive_number, read_only, short_repr, truth
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
-from d4orm_env.disturbances.controls import Lag
 from d4orm_env.envs.joint_state import JointState, split_state
-from d4orm_planners.base.disturbance_observer import DisturbanceObserver, check_lag
+from d4orm_planners.base.disturbance_observer import DisturbanceObserver, check_lag, with_lag_of
 from d4orm_planners.base.episode import open_env
-from d4orm_planners.base.measured_states import brought_up, completed, seconds
+from d4orm_planners.base.measured_states import OLDEST, brought_up, completed, seconds
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
 from d4orm_planners.base.policy import Actions, Observations, OpenLoop, Policy, robot_indices
 from d4orm_planners.base.policy_threads import Background, check_episode
@@ -46,8 +35,6 @@ Mode = Literal["nominal", "measured"]
 
 SAME_PERIOD = 0.5
 """Share of a period within which another call gets the same setpoint."""
-OLDEST = 10
-"""Age of a measured state at most, in periods."""
 LATE = 0.25
 """Share of a period by which a late step's successors may come earlier than a period after it."""
 IN_TIME = 0.9
@@ -109,8 +96,7 @@ class Controller:
     ) -> None:
         if mode not in get_args(Mode):
             raise ValueError(f"mode is {short_repr(mode)}; choose one of {', '.join(get_args(Mode))}")
-        self.mode = mode
-        default = 0.5 if tracker else 0.2 if mode == "nominal" else 0.0
+        self.mode, default = mode, 0.5 if tracker else 0.2 if mode == "nominal" else 0.0
         self.reserve = default if reserve is None else positive_number(reserve, "reserve", zero_allowed=True, most=0.9)
         self.timeout = None if timeout is None else positive_number(timeout, "timeout")
         if self.timeout is not None and isinstance(policy, str) and "deadline" in setting_names(policy, settings):
@@ -190,7 +176,7 @@ class Controller:
         Args:
             states: ``(K, n)`` measured states, NaN for what is missing.
             time: Now [s].
-            age: How long ago they were measured [s], one or ``(K,)``, at most :data:`OLDEST` periods: robots are taken
+            age: How long ago they were measured [s], one or ``(K,)``, at most ten periods: robots are taken
                 to have gone on since, as what they were told has it.
 
         Raises:
@@ -199,9 +185,7 @@ class Controller:
         """
         reference, dt = self._joint.states, self.problem.dt
         measured, known = completed(self.problem, self._bounds, states, reference, self._expected)
-        ages = frozen_per_robot(age, "age", len(known), zero_allowed=True)
-        refuse_robots(ages > OLDEST * dt, "age", ages, f"at most {OLDEST} periods; give NaN for what is older", " s")
-        measured = brought_up(self._robots, measured, self._driven, np.where(known, ages, np.float32(0)))
+        measured = brought_up(self._robots, measured, known, self._driven, age)
         passed = (seconds(time) - self._time) / dt
         if abs(passed) >= SAME_PERIOD:
             self._setpoint = self._advance(measured, known)
@@ -212,15 +196,8 @@ class Controller:
         return self._setpoint
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
-        """Take over the team of an environment: controllers are policies, for :func:`~d4orm_planners.run_episode`.
-
-        Where the team has a lag, it is that of the environment here: of its ``Lag``, or none.
-        """
-        problem: Problem = env.unwrapped.problem
-        if problem.team.lag.any():
-            lag = sum(one.time_constant for one in env.unwrapped.options.disturbances if isinstance(one, Lag))
-            team = problem.team.replace(lag=np.where(problem.team.lag > 0, lag, 0.0))
-            problem = problem.with_state(problem.start, problem.goal, team=team)
+        """Take over the team of an environment: controllers are policies, for :func:`~d4orm_planners.run_episode`."""
+        problem = with_lag_of(env)
         self.begin(problem, split_state(problem, env.state()).states, seed=seed)
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:

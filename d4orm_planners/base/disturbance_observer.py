@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, short_repr
 from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.controls import Lag
 from d4orm_planners.tracking.reference_feedback import ActuatorLag
 from d4orm_planners.tracking.steering import limit_controls, rates, short_way_round
+
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
 
 GAIN = 0.1
 """Share of a step's residual that goes into the estimate."""
@@ -31,6 +37,16 @@ def check_lag(lag: ArrayLike) -> ArrayLike:
     if not (np.isfinite(constants) & (constants >= 0)).all():
         raise ValueError(f"lag is {short_repr(lag)}; it must be finite and not negative")
     return lag
+
+
+def with_lag_of(env: ParallelEnv) -> Problem:
+    """The problem of an environment; if its team has a lag, with that of the environment's ``Lag``, or without."""
+    problem: Problem = env.unwrapped.problem
+    if not problem.team.lag.any():
+        return problem
+    lag = sum(one.time_constant for one in env.unwrapped.options.disturbances if isinstance(one, Lag))
+    team = problem.team.replace(lag=np.where(problem.team.lag > 0, lag, 0.0))
+    return problem.with_state(problem.start, problem.goal, team=team)
 
 
 class DisturbanceObserver:

@@ -10,11 +10,22 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, frozen_array, numbers_of, short_repr
+from d4orm_env.core.arrays import (
+    BoolArray,
+    FloatArray,
+    as_float32,
+    frozen_array,
+    frozen_per_robot,
+    numbers_of,
+    refuse_robots,
+    short_repr,
+)
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.winding import MAX_ANGLE
 from d4orm_planners.tracking.steering import advanced, by_model, short_way_round
 
+OLDEST = 10
+"""Age of a measured state at most, in periods."""
 BEYOND = 4
 """Distance beyond the state space at which measured numbers are cut off, in sizes of the space."""
 LATEST = 1e12
@@ -33,13 +44,18 @@ def seconds(time: object) -> float:
     raise ValueError(f"time is {short_repr(time)}; give the seconds of one clock")
 
 
-def brought_up(problem: Problem, states: FloatArray, driven: Sequence[FloatArray], ages: FloatArray) -> FloatArray:
-    """``(K, n)`` states after their ages ``(K,)`` [s], as the models have it: by what robots were ``driven`` by
-    ``(K, m)`` in the last periods, at rest before.
+def brought_up(
+    problem: Problem, states: FloatArray, known: BoolArray, driven: Sequence[FloatArray], age: ArrayLike
+) -> FloatArray:
+    """``(K, n)`` states of robots that are ``known`` after their ``age`` [s], as the models have it: by what they were
+    ``driven`` by ``(K, m)`` in the last periods, at rest before. ValueError for an age above :data:`OLDEST` periods.
     """
-    steps = ages[:, None] / np.float32(problem.dt)
+    steps = frozen_per_robot(age, "age", len(known), zero_allowed=True) / np.float32(problem.dt)
+    remedy = f"at most {OLDEST} periods; give NaN for what is older"
+    refuse_robots(steps > OLDEST, "age", steps * np.float32(problem.dt), remedy, " s")
+    steps = np.where(known, steps, np.float32(0))[:, None]
     for back in range(int(np.ceil(steps.max())), 0, -1):
-        controls = driven[-back] if back <= len(driven) else np.zeros((len(ages), problem.control_size), np.float32)
+        controls = driven[-back] if back <= len(driven) else np.zeros((len(known), problem.control_size), np.float32)
         moved = short_way_round(problem, advanced(problem, states, controls) - states)
         states = states + np.clip(steps - (back - 1), 0, 1) * moved
     return states

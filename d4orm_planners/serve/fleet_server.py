@@ -11,7 +11,8 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, positive_number
 from d4orm_env.core.problem import Problem
-from d4orm_planners.base.controller import OLDEST, Controller
+from d4orm_planners.base.controller import Controller
+from d4orm_planners.base.measured_states import OLDEST
 from d4orm_planners.serve import wire
 from d4orm_planners.serve.fleet_robot import FleetRobot
 from d4orm_planners.serve.wire import RosSession, Subscriber, position_of, turned
