@@ -36,6 +36,8 @@ pyrvo: Any = LazyModule("pyrvo", "policy 'orca'", "orca")
 
 NEARBY = 4.0
 """Distance from its goal within which a robot goes by curves to its goal heading, in radii of its turning circle."""
+UNDISTURBED = 1e-3
+"""Share of its speed limit by which nobody who is near changes a robot's velocity."""
 CORNERS = 16
 """Corners of the polygons that stand for round obstacles and robots at rest."""
 
@@ -98,19 +100,25 @@ class Orca(StatePolicy):
         if (by_curves := curving(problem)).any():
             left, bend = (np.linalg.norm(joint.goals - points, axis=1) for points in (joint.states[:, :2], aims))
             by_curves &= (left < NEARBY * problem.team.turning_radius) & (bend <= problem.goal_radius)
-            own = velocities_to_goals(problem, joint.states, joint.goals)
+            own, free = velocities_to_goals(problem, joint.states, joint.goals)
             preferred = np.where(by_curves[:, None], own, preferred)
-        return track_velocities(problem, joint.states, self._avoid_known(joint, preferred))
+            by_curves &= free
+        velocities = self._avoid_known(joint, preferred)
+        if by_curves.any():  # what the disc round a robot touches is none of its curve's business, if nobody is near
+            alone = np.abs(self._avoid_known(joint, preferred, walls=False) - preferred).max(axis=1)
+            alone = by_curves & (alone <= UNDISTURBED * problem.team.max_speed)
+            velocities = np.where(alone[:, None], preferred, velocities)
+        return track_velocities(problem, joint.states, velocities)
 
-    def _avoid_known(self, joint: JointState, preferred: FloatArray) -> FloatArray:
+    def _avoid_known(self, joint: JointState, preferred: FloatArray, walls: bool = True) -> FloatArray:
         """:meth:`_avoid`, every robot by itself among those it knows of where these are not all."""
         if self._known == (None, False):
-            return self._avoid(joint, preferred, np.arange(len(preferred)))
+            return self._avoid(joint, preferred, np.arange(len(preferred)), walls)
         links = communication_links(self.problem, joint.states[:, :2], *self._known)
         alone = [np.flatnonzero(known | (np.arange(len(known)) == robot)) for robot, known in enumerate(links)]
-        return np.stack([self._avoid(joint, preferred, team)[robot] for robot, team in enumerate(alone)])
+        return np.stack([self._avoid(joint, preferred, team, walls)[robot] for robot, team in enumerate(alone)])
 
-    def _avoid(self, joint: JointState, preferred: FloatArray, team: IntArray) -> FloatArray:
+    def _avoid(self, joint: JointState, preferred: FloatArray, team: IntArray, walls: bool) -> FloatArray:
         """``(K, 2)`` velocities of these robots, nearest to the preferred ones, that avoid everything and each other.
 
         Those of arrived robots and of others are zero.
@@ -139,7 +147,7 @@ class Orca(StatePolicy):
                 velocities[robot].tolist(),
             )
         arrived = [_disc(positions[k, 0], positions[k, 1], radius[k]) for k in team[absorbed[team]]]
-        for corners in [*(wall / unit for wall in self._walls), *arrived]:
+        for corners in [*(wall / unit for wall in self._walls if walls), *arrived]:
             simulator.add_obstacle(corners.tolist())
         simulator.process_obstacles()
         for agent, robot in enumerate(moving):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.envs.joint_state import JointState
+from d4orm_planners.tracking.free_curves import free_curves
 from d4orm_planners.tracking.pose_curves import first_stretches
 from d4orm_planners.tracking.steering import (
     CREEPING,
@@ -28,7 +31,7 @@ UNNOTICED = 0.08
 
 def drive_to_goal(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
     """``(K, m)`` controls inside each robot's limits, from states ``(K, n)`` to goals ``(K, d)`` [m]."""
-    return track_velocities(problem, states, velocities_to_goals(problem, states, goals))
+    return track_velocities(problem, states, velocities_to_goals(problem, states, goals)[0])
 
 
 def brake_to_dock(problem: Problem, robots: list[int], controls: FloatArray, joint: JointState) -> FloatArray:
@@ -37,27 +40,31 @@ def brake_to_dock(problem: Problem, robots: list[int], controls: FloatArray, joi
     return np.where(braking, drive_to_goal(problem, joint.states, joint.goals)[robots], controls)
 
 
-def velocities_to_goals(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
-    """``(K, d)`` velocities [m/s] to goals ``(K, d)`` [m], as :func:`preferred_velocities`; along the shortest curves,
-    from arc to arc, to goal headings of robots that turn only as they drive.
+def velocities_to_goals(problem: Problem, states: FloatArray, goals: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """``(K, d)`` velocities [m/s] to goals ``(K, d)`` [m], as :func:`preferred_velocities`; along the shortest free
+    curves, from arc to arc, to goal headings of robots that turn only as they drive. And ``(K,)`` whose curves are free
+    of the obstacles that there are.
 
     Nothing is remembered: where a robot does not follow a curve, it goes on by the one from where it is.
     """
     circle, robots = problem.team.turning_radius, np.flatnonzero(curving(problem))
+    free = np.zeros(problem.num_robots, bool)
     if not len(robots):
-        return preferred_velocities(problem, states, goals)
+        return preferred_velocities(problem, states, goals), free
     radius, headings = (part[robots].astype(np.float64) for part in (circle, problem.team.headings(states)))
     ahead, left = _turned((goals - states[:, :2])[robots].astype(np.float64), -headings).T / radius
     wheels, turns = _curvatures(problem, states)[robots] * radius, problem.goal_heading[robots] - headings
     missed = np.minimum(problem.goal_heading_tolerance[robots], problem.goal_radius / radius)
-    side, length = first_stretches(ahead, left, turns, UNNOTICED * missed, wheels)
+    walls = problem.world.num_obstacles or problem.world.lower is not None
+    choose = partial(free_curves, problem, robots, np.column_stack([states[robots, :2], headings])) if walls else None
+    side, length, free[robots] = first_stretches(ahead, left, turns, UNNOTICED * missed, wheels, choose)
     aims, turn = goals.copy(), side * np.where(length < 0, -REVERSING, TURNING)
     away = np.stack([np.abs(length) * radius, np.zeros_like(radius)], axis=1)
     aims[robots] = states[robots, :2] + _turned(away, headings + turn)
     velocities = preferred_velocities(problem, states, aims)
     off = np.nan_to_num(np.abs(side - wheels))
     velocities[robots] *= np.maximum(1 - STEERING_FIRST * off, CREEPING)[:, None]
-    return velocities
+    return velocities, free
 
 
 def curving(problem: Problem) -> BoolArray:

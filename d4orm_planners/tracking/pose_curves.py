@@ -8,12 +8,13 @@ they are negative.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import BoolArray, Floats
+from d4orm_env.core.arrays import BoolArray, Floats, IntArray
 
 LEFT, STRAIGHT, RIGHT = 1.0, 0.0, -1.0
 QUARTER = np.pi / 2
@@ -29,9 +30,13 @@ class FirstStretch(NamedTuple):
 
     side: Floats  #: ``(K,)`` :data:`LEFT`, :data:`STRAIGHT` or :data:`RIGHT`
     length: Floats  #: ``(K,)`` negative backwards; zero if there is nothing to drive
+    free: BoolArray  #: ``(K,)`` whether it was chosen
 
 
-def first_stretches(ahead: Floats, left: Floats, turns: Floats, short: Floats, wheels: Floats) -> FirstStretch:
+def first_stretches(
+    ahead: Floats, left: Floats, turns: Floats, short: Floats, wheels: Floats,
+    choose: Callable[[Floats, Floats], IntArray] | None = None,
+) -> FirstStretch:  # fmt: skip
     """First stretches of the shortest curves.
 
     Args:
@@ -40,6 +45,8 @@ def first_stretches(ahead: Floats, left: Floats, turns: Floats, short: Floats, w
         turns: ``(K,)`` from the robots' headings to their goals' [rad].
         short: ``(K,)`` length up to which a stretch is left out.
         wheels: ``(K,)`` present curvatures; NaN for robots that take any at once.
+        choose: ``(K,)`` which is taken of the sides and lengths ``(W, K, 5)`` of all curves, the shortest first; -1
+            for none, and so for the shortest.
     """
     sides, lengths = curves(ahead, left, turns, short)
     gears = np.where(np.abs(lengths) > short[:, None], np.sign(lengths), 0.0)
@@ -49,9 +56,13 @@ def first_stretches(ahead: Floats, left: Floats, turns: Floats, short: Floats, w
         driven = own_gear != 0
         costs += CUSP * (own_gear * gear < 0) + np.where(driven & inert, WHEELS * np.abs(own_side - side), 0)
         gear, side = np.where(driven, own_gear, gear), np.where(driven, own_side, side)
-    best, every = costs.argmin(axis=0), np.arange(len(turns))
+    best, every, found = costs.argmin(axis=0), np.arange(len(turns)), np.full(len(turns), -1)
+    if choose is not None:
+        order = costs.argsort(axis=0, kind="stable")
+        found = choose(sides[order, every], lengths[order, every])
+        best = order[np.maximum(found, 0), every]
     chosen = best, every, first[best, every]
-    return FirstStretch(sides[chosen], np.where(gears[chosen] != 0, lengths[chosen], 0.0))
+    return FirstStretch(sides[chosen], np.where(gears[chosen] != 0, lengths[chosen], 0.0), found >= 0)
 
 
 def curves(ahead: Floats, left: Floats, turns: Floats, short: Floats) -> tuple[Floats, Floats]:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from d4orm_env import Problem, Team, navigation_v0
+from d4orm_env import Problem, Team, World, navigation_v0
+from d4orm_env.core.gaps import world_gap
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.footprints import Box
 from d4orm_planners import run_episode
 from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
+from d4orm_planners.tracking.free_curves import free_curves
 from d4orm_planners.tracking.goal_drives import drive_to_goal
 from d4orm_planners.tracking.pose_curves import CUSP, STRAIGHT, curves, first_stretches
 from d4orm_planners.tracking.steering import preferred_velocities, track_velocities
@@ -28,6 +31,16 @@ def off(ends: np.ndarray, x: np.ndarray, y: np.ndarray, turns: np.ndarray) -> np
     return np.abs(ends[..., 0] - x) + np.abs(ends[..., 1] - y) + np.abs(turned)
 
 
+def driven(ends: np.ndarray, side: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Poses ``(..., 3)`` in turning radii after stretches."""
+    x, y, before = np.moveaxis(ends, -1, 0)
+    bent, after = side != STRAIGHT, before + side * length
+    radius = np.where(bent, side, 1)
+    x = x + np.where(bent, radius * (np.sin(after) - np.sin(before)), length * np.cos(before))
+    y = y - np.where(bent, radius * (np.cos(after) - np.cos(before)), -length * np.sin(before))
+    return np.stack([x, y, after], axis=-1)
+
+
 @pytest.mark.parametrize("reach", [0.1, 1.0, 4.0, 30.0])
 def test_curves_lead_to_the_goal(reach: float) -> None:
     x, y, turns = poses(500, reach)
@@ -37,17 +50,13 @@ def test_curves_lead_to_the_goal(reach: float) -> None:
     assert (lengths[exists] >= 0)[sides[exists] == STRAIGHT].all()  # straights are driven forwards
     ends = np.zeros((*exists.shape, 3))
     for side, length in zip(np.moveaxis(sides, -1, 0), np.moveaxis(np.where(exists[..., None], lengths, 0), -1, 0)):
-        before, bent = ends[..., 2].copy(), side != STRAIGHT
-        ends[..., 2] += side * length
-        radius = np.where(bent, side, 1)
-        ends[..., 0] += np.where(bent, radius * (np.sin(ends[..., 2]) - np.sin(before)), length * np.cos(before))
-        ends[..., 1] -= np.where(bent, radius * (np.cos(ends[..., 2]) - np.cos(before)), -length * np.sin(before))
+        ends = driven(ends, side, length)
     assert off(ends, x, y, turns)[exists].max() < 1e-6 * max(reach, 1)
 
 
 def test_no_curve_is_longer_than_it_needs_be() -> None:
     # A turn on the spot, nearly: forwards, back and forwards again, each by a third of it.
-    side, length = first_stretches(np.zeros(1), np.zeros(1), np.array([0.3]), np.full(1, 1e-3), np.full(1, np.nan))
+    side, length, _ = first_stretches(np.zeros(1), np.zeros(1), np.array([0.3]), np.full(1, 1e-3), np.full(1, np.nan))
     _, lengths = curves(np.zeros(1), np.zeros(1), np.array([0.3]), np.full(1, 1e-3))
     assert np.abs(lengths).sum(axis=-1).min() == pytest.approx(0.3, rel=1e-3)
     assert abs(length[0]) < 0.3
@@ -69,6 +78,51 @@ def test_cars_arrive_with_their_headings(model: str, turn: float) -> None:
     problem = Problem(team, start, goal, goal_heading=heading, horizon=400)
     episode = run_episode(navigation_v0.parallel_env(problem=problem), "go-to-goal")
     assert episode.trajectory.arrived[-1].all()
+
+
+def gap_along(problem: Problem, pose: np.ndarray, sides: np.ndarray, lengths: np.ndarray) -> float:
+    """Least gap of a car to the world on a curve, in fine steps."""
+    radius, least = float(problem.team.turning_radius[0]), np.inf
+    end = np.array([pose[0] / radius, pose[1] / radius, pose[2]])
+    for side, length in zip(sides, lengths):
+        for share in np.linspace(0, 1, 60)[1:]:
+            x, y, heading = driven(end, side, share * length)
+            least = min(
+                least, world_gap(problem.world, problem.team.footprint[0], np.array([x * radius, y * radius, heading]))
+            )
+        end = driven(end, side, length)
+    return least
+
+
+def test_the_shortest_free_curve_is_taken() -> None:
+    world = World(2, boxes=[[-3, -2, 3, -0.3]], lower=[-3, -3], upper=[3, 3])
+    team, chosen = Team(("car_first_order",), footprint=Box(0.36, 0.24, 0.1)), []
+    radius, none = float(team.turning_radius[0]), np.zeros(1)
+    for x, y, heading in zip(*poses(10, 1.5)):
+        pose = np.array([x, abs(y), heading])
+        problem = Problem(team, [pose], [[0, 0]], goal_heading=0.0, world=world)
+        away, turned = (
+            -pose[:2] / radius,
+            np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]]),
+        )
+        sides, lengths = curves(*(turned @ away)[:, None], -np.array([heading]), none)
+        order = np.abs(lengths).sum(axis=2)[:, 0].argsort(kind="stable")
+        sides, lengths = sides[order], lengths[order]
+        found = free_curves(problem, np.zeros(1, np.int64), pose[None], sides, lengths)[0]
+        gaps = [gap_along(problem, pose, sides[w, 0], lengths[w, 0]) for w in range(max(found, 0) + 1)]
+        chosen.append(found)
+        if found >= 0:
+            assert gaps[found] > 0
+            assert max(gaps[:found], default=-1) < problem.margin + 1e-3
+    assert max(chosen) > 0
+
+
+@pytest.mark.parametrize("policy", ["go-to-goal", "orca"])
+def test_cars_beside_a_wall_take_another_curve(policy: str) -> None:
+    """By the shortest one this car would run into the wall; `orca` would stop before."""
+    start, wall = [1.7722, 1.4136, 2.9923], World(2, boxes=[[-4, -2, 4, -0.25]])
+    problem = Problem(Team(("car_first_order",)), [start], [[0, 0]], goal_heading=0.0, world=wall, horizon=200)
+    assert run_episode(navigation_v0.parallel_env(problem=problem), policy, seed=4).metrics["success"]
 
 
 def test_orca_alone_does_too() -> None:
