@@ -32,6 +32,9 @@ OBJECTIVE_SCALE = 10.0
 TINY = 1e-9
 """Added to squared distances, since the square root has no derivative at zero, in the program's units."""
 
+CERTAIN = 0.98
+"""Share of the tolerance of a goal heading within which a robot faces it beyond doubt."""
+
 Contacts = dict[tuple[int, int], NDArray[np.int64]]
 """Steps at which robot ``k`` is kept clear of body ``b``: robot ``b``, or from ``K`` on obstacle ``b - K``."""
 
@@ -219,7 +222,9 @@ class TeamProgram:
             yield self.controls[robot], components, -float(lower[column]), float(limits[column])
 
     def _goal_rows(self, arrivals: IntArray) -> Iterator[Rows]:
-        """At the step of its arrival a robot is within the goal radius, and no faster than its goal speed."""
+        """At the step of its arrival a robot is within the goal radius, no faster than its goal speed, and faces as it
+        is to.
+        """
         problem = self.problem
         radius = problem.goal_radius - min(self.clearance, problem.goal_radius / 2)
         for robot, arrival in enumerate(arrivals):
@@ -231,6 +236,17 @@ class TeamProgram:
                 velocity = self.models[robot].functions.velocity(x, u, limits, self.ops)
                 pace = sum((part / self.unit) ** 2 for part in velocity)
                 yield pace, -np.inf, (float(problem.goal_speed[robot]) / self.unit) ** 2
+            yield from self._facing_rows(robot, self.states[robot][:, arrival - 1])
+
+    def _facing_rows(self, robot: int, state: Expression) -> Iterator[Rows]:
+        """In this state a robot has its goal heading, and its trailers their hitch angles, as far as they are given."""
+        problem, tolerance = self.problem, CERTAIN * float(self.problem.goal_heading_tolerance[robot])
+        if not np.isnan(wanted := float(problem.goal_heading[robot])):
+            off = state[self.models[robot].heading_index] - wanted
+            yield (1 - self.casadi.cos(off)) / (1 - np.cos(tolerance)), -np.inf, 1.0
+        for (hitch, _), angle in zip(self.models[robot].trailers, problem.goal_hitches[robot].tolist()):
+            if not np.isnan(angle):
+                yield (state[hitch] - angle) / tolerance, -1.0, 1.0
 
     def _contact_rows(self, contacts: Contacts, arrivals: IntArray) -> Iterator[Rows]:
         for (robot, body), steps in contacts.items():

@@ -76,6 +76,14 @@ def test_four_robots_cross_a_circle(seed: int, preset: str | None) -> None:
     assert_solves("ipopt", make_problem("circle", num_robots=4), seed=seed, preset=preset)
 
 
+@pytest.mark.parametrize("model", ["differential_drive", "car_with_1_trailer"])
+def test_goal_headings_are_met(model: str) -> None:
+    problem = swap_problem(("holonomic2d", model), goal_heading=[np.nan, 2.0], horizon=80)
+    if model == "car_with_1_trailer":
+        problem = problem.replace(goal_hitches=[[np.nan], [0.3]])
+    assert_solves("ipopt", problem)
+
+
 def test_a_goal_speed_is_kept() -> None:
     plan = assert_solves("ipopt", swap_problem(goal_speed=0.1))
     before = plan.trajectory.arrived.argmax(axis=0) - 1
