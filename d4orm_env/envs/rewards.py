@@ -15,6 +15,7 @@ from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.engine.types import WorldBatch
+from d4orm_env.envs.features import ArrayOrTensor, namespace
 
 __all__ = ["RewardFunction", "RewardInput", "TrainingReward"]
 
@@ -35,6 +36,9 @@ class RewardInput:
     previous_distances: FloatArray  #: ``(..., K)`` to the goals before the step [m]
     distances: FloatArray  #: ``(..., K)`` after it [m]
     initial_distances: FloatArray  #: ``(..., K)`` where the path to the goal began, at least the goal radius [m]
+    #: ``(..., K)`` that are left to the goal headings before the step [rad]; see :func:`turns_left`
+    previous_turns: FloatArray
+    turns: FloatArray  #: ``(..., K)`` after it [rad]
     previously_arrived: BoolArray  #: ``(..., K)`` bool: docked before the step
     arrived: BoolArray  #: ``(..., K)`` bool: docked after it; in lifelong mode, reached a goal in this step
     collided: BoolArray  #: ``(..., K)`` bool, hard contact
@@ -66,8 +70,11 @@ class RewardInput:
             "arrived": arrived, "collided": after.collided, "margin_violated": after.violated, "paper": paper,
         }  # fmt: skip
         parts: dict[str, Any] = {name: array[rows] for name, array in arrays.items()}
-        initial = np.float32(1) / after.inverse[rows]
-        return cls(**parts, initial_distances=initial, team=problem.team, dt=problem.dt)
+        parts["initial_distances"] = np.float32(1) / after.inverse[rows]
+        for name, states in (("previous_turns", parts["previous_states"]), ("turns", parts["states"])):
+            headed = problem.arrays.goal_direction is not None
+            parts[name] = turns_left(problem, states, parts["goals"]) if headed else np.zeros_like(parts["distances"])
+        return cls(**parts, team=problem.team, dt=problem.dt)
 
     @property
     def previous_positions(self) -> FloatArray:
@@ -78,6 +85,28 @@ class RewardInput:
     def positions(self) -> FloatArray:
         """``(..., K, d)`` after the step [m]."""
         return self.states[..., : self.goals.shape[-1]]
+
+
+def turns_left(problem: Problem, states: ArrayOrTensor, goals: ArrayOrTensor) -> ArrayOrTensor:
+    """``(..., K)`` turns from headings in states ``(..., K, n)`` to goal headings [rad], zero for a robot without one.
+
+    On its way a robot turns to the goal ``(..., K, d)`` first, or away from it to back up, and from there to the goal
+    heading. These are the angles of M. Aicardi, G. Casalino, A. Bicchi and A. Balestrino, "Closed loop steering of
+    unicycle like vehicles via Lyapunov techniques", IEEE Robotics & Automation Magazine, 1995.
+    """
+    xp, columns = namespace(states), np.array([model.heading_index or 0 for model in problem.team.robot_models])
+    heading, wanted = states[..., np.arange(len(columns)), columns], xp.nan_to_num(problem.goal_heading)
+    x, y = goals[..., 0] - states[..., 0], goals[..., 1] - states[..., 1]
+    ahead = xp.arctan2(y, x)
+    by_goal = [_between(heading, faced) + _between(faced, wanted) for faced in (ahead, ahead + np.float32(np.pi))]
+    there = x * x + y * y <= problem.goal_radius**2
+    left = xp.where(there, _between(heading, wanted), xp.minimum(*by_goal))
+    return xp.where(xp.isnan(problem.goal_heading), np.float32(0), left)
+
+
+def _between(one: ArrayOrTensor, other: ArrayOrTensor) -> ArrayOrTensor:
+    """Angles between directions, at most half a turn."""
+    return abs((one - other + np.pi) % (2 * np.pi) - np.pi)
 
 
 RewardFunction = Callable[[RewardInput], ArrayLike]
@@ -93,7 +122,8 @@ class TrainingReward:
     D. Harada and S. Russell, ICML 1999), and the arrival.
 
     Attributes:
-        progress: For every step's distance at full speed towards the goal.
+        progress: For every step's distance at full speed towards the goal, and turn at the largest turn rate towards
+            the goal heading, as far as the robot has to turn on its way by the goal.
         arrival: Once, on arriving.
         margin: Taken off in every step within the margin of anything.
         contact: Taken off in every step in contact with anything.
@@ -124,8 +154,9 @@ class TrainingReward:
     def terms(self, step: RewardInput) -> dict[str, FloatArray]:
         """``(..., K)`` each, by the names of the weights."""
         longest, acting = step.team.max_speed * step.dt, ~step.previously_arrived
+        turned = (step.previous_turns - step.turns) * (step.team.max_speed / step.team.max_turn_rate)
         return {
-            "progress": self.progress * (step.previous_distances - step.distances) / longest * acting,
+            "progress": self.progress * (step.previous_distances - step.distances + turned) / longest * acting,
             "arrival": self.arrival * step.arrived * acting,
             "margin": -self.margin * step.margin_violated * acting,
             "contact": -self.contact * step.collided * acting,

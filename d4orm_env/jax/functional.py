@@ -29,7 +29,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
-from d4orm_env.envs.rewards import RewardFunction, RewardInput, find_reward, term_names
+from d4orm_env.envs.rewards import RewardFunction, RewardInput, find_reward, term_names, turns_left
 from d4orm_env.jax.jax_engine import check_contacts, goal_distance
 from d4orm_env.jax.jax_motion import Worlds, advance_worlds
 from d4orm_env.jax.jax_observation import observe_team
@@ -139,6 +139,8 @@ def _reward_input(problem: Problem, state: State, after: State, happened: Step, 
         "previous_distances": distances,
         "distances": happened.distances,
         "initial_distances": 1 / arrays.inverse_initial_distance,
+        "previous_turns": turns_left(problem, state.states, arrays.goal),
+        "turns": turns_left(problem, after.states, arrays.goal),
         "previously_arrived": state.arrived,
         "arrived": after.arrived,
         "collided": happened.collided,

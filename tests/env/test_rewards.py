@@ -11,6 +11,7 @@ from env_support import act, line_problem, mixed_problem
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
 from d4orm_env.disturbances import Disturbance, Intruder
 from d4orm_env.envs.joint_env import JointNavigationEnv
 from d4orm_env.envs.rewards import RewardInput, TrainingReward
@@ -110,6 +111,30 @@ def test_the_training_reward_in_numbers() -> None:
     assert rewards["robot_0"] == pytest.approx(scale.progress + scale.arrival - scale.time, abs=1e-5)
     env.step(act(env, np.float32([[1, 0], [1, 0]])))
     assert env.last_step.rewards[0] == 0
+
+
+def test_the_training_reward_pays_turns_to_goal_headings() -> None:
+    """Beside its goal, on its way, backing up, and without a goal heading; at the largest turn rate and half of it."""
+    team = Team(("differential_drive",) * 4, max_turn_rate=[1.0, 2.0, 1.0, 1.0])
+    start, goal = [[0, 0, 3, 0], [0, 2, 0.5, 0], [0, 4, 3, 0], [0, 6, 0, 0]], [[0.05, 0], [1, 2], [1, 4], [1, 6]]
+    problem = Problem(team, start, goal, goal_heading=[-3, -1, 3, np.nan])
+    turning, seen = np.float32([[1, 0]] * 4), []
+
+    def look(step: RewardInput) -> Any:
+        seen.append(step)
+        return step.paper
+
+    env = navigation_v0.parallel_env(problem=problem, reward=look)
+    env.reset(seed=0)
+    env.step(act(env, turning))
+    backwards = 2 * (np.pi - 3)
+    np.testing.assert_allclose(seen[0].previous_turns, [2 * np.pi - 6, 1.5, backwards, 0], atol=1e-5)
+    np.testing.assert_allclose(seen[0].turns, [2 * np.pi - 6.1, 1.6, backwards - 0.1, 0], atol=1e-5)
+    env = navigation_v0.parallel_env(problem=problem, reward="training")
+    env.reset(seed=0)
+    rewards, scale = env.step(act(env, turning))[1], TrainingReward()
+    for robot, paid in enumerate([scale.progress, -scale.progress / 2, scale.progress, 0]):
+        assert rewards[f"robot_{robot}"] == pytest.approx(paid - scale.time, abs=1e-5)
 
 
 @pytest.mark.parametrize("terms", [[np.zeros(2)], {"near": np.zeros(2)}, {"fast": np.zeros(2), "more": np.zeros(2)}])
