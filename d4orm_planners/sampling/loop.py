@@ -161,8 +161,9 @@ class SamplingPlanner(Planner):
         return Iteration(self.braking(search, controls), num_steps, excluded), following
 
     def braking(self, search: SolveRun, controls: FloatArray) -> FloatArray:
-        """``(H, K, m)`` the controls, with final approaches where robots must slow down for their goals."""
-        if not self.config.final_approach or np.isinf(search.problem.goal_speed).all():
+        """``(H, K, m)`` the controls, with final approaches where robots must slow down at their goals, or turn."""
+        poses = np.isfinite(search.problem.goal_speed) | ~np.isnan(search.problem.goal_heading)
+        if not (self.config.final_approach and poses.any()):
             return controls
         trajectory = search.engine.rollout(search.problem, controls)
         team = WorkingPlan(search, trajectory)

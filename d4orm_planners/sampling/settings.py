@@ -102,9 +102,9 @@ class SamplingConfig(PlannerConfig):
     #: takes, by rewards that make up for the shortness (:func:`d4orm_planners.sampling.loop.on_short_paths`). The paper
     #: always samples all steps.
     short_paths: bool = True
-    #: Whether robots that must slow down to dock (:attr:`~d4orm_env.core.problem.Problem.goal_speed`) turn straight to
-    #: their goals after an iteration, and brake there, where that makes nothing worse. Samples hardly ever stop
-    #: anywhere. The paper's robots need not.
+    #: Whether robots that must slow down to dock (:attr:`~d4orm_env.core.problem.Problem.goal_speed`), or turn to goal
+    #: headings, turn straight to their goals after an iteration, and brake there, where that makes nothing worse.
+    #: Samples hardly ever stop anywhere. The paper's robots need not.
     final_approach: bool = True
 
 

@@ -200,6 +200,15 @@ def test_goals_that_stop_robots_need_no_final_approach() -> None:
     np.testing.assert_array_equal(plans[0].controls, plans[1].controls)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_robots_that_need_not_brake_turn_to_goal_headings(seed: int) -> None:
+    team = Team(("unicycle",) * 2)
+    start, goal, headings = [[0, 0, 0.86], [0, 3, -2.88]], [[1.87, -0.71], [1.45, 1.62]], [1.97, np.nan]
+    problem = Problem(team, start, goal, goal_heading=headings, horizon=150)
+    plan = make_planner("d4orm", engine="cpu").solve(problem, seed=seed, max_iterations=2)
+    assert plan.solved, plan.failures
+
+
 def test_who_cannot_wait_with_braking() -> None:
     problem = make_problem("circle", num_robots=4, diameter=8.0)
     goals = problem.goal
