@@ -87,41 +87,40 @@ def curves(ahead: Floats, left: Floats, turns: Floats, short: Floats) -> tuple[F
 
 
 def _words(x: Floats, y: Floats, turn: Floats, sine: Floats, cosine: Floats, short: Floats) -> list[Word]:
-    """The paper's curves that begin forwards to the left, equations 8.1 to 8.11; those of four arcs are left out."""
+    """The paper's curves that begin forwards to the left, equations 8.1 to 8.11; those of four arcs are left out.
+
+    The same with arcs backwards lead there too: a robot that has driven past the end of one has not lost its curve.
+    """
     same, other = (x - sine, y - 1 + cosine), (x + sine, y - 1 - cosine)
     (near, bearing), (far, angle) = _polar(*same), _polar(*other)
     last = _within(turn - bearing)
-    words: list[Word] = [
-        ((LEFT, STRAIGHT, LEFT, 0, 0), (bearing >= -short) & (last >= -short), (bearing, near, last, 0, 0))
-    ]
+    words: list[Word] = [((LEFT, STRAIGHT, LEFT, 0, 0), near >= 0, (bearing, near, last, 0, 0))]
     straight = np.sqrt(np.maximum(far * far - 4, 0))
     first = _within(angle + portable.arctan2(np.full_like(far, 2.0), straight))
     last = _within(first - turn)
     apart = far >= 2
-    words.append(
-        ((LEFT, STRAIGHT, RIGHT, 0, 0), apart & (first >= -short) & (last >= -short), (first, straight, last, 0, 0))
-    )
+    words.append(((LEFT, STRAIGHT, RIGHT, 0, 0), apart, (first, straight, last, 0, 0)))
     # Two cusps, the straight between quarter circles.
     straight = 4 - straight
     first = _within(
         portable.arctan2((4 - straight) * other[0] - 2 * other[1], -2 * other[0] + (straight - 4) * other[1])
     )
     last = _within(first - turn)
-    exists = apart & (straight <= short) & (first >= -short) & (last >= -short)
+    exists = apart & (straight <= short)
     words.append(((LEFT, RIGHT, STRAIGHT, LEFT, RIGHT), exists, (first, -QUARTER, straight, -QUARTER, last)))
     half = np.minimum(near / 4, 1)
     middle = -2 * portable.arctan2(half, np.sqrt(1 - half * half))
     first = _within(bearing + middle / 2 + np.pi)
     last = _within(turn - first + middle)
-    words.append(((LEFT, RIGHT, LEFT, 0, 0), (near <= 4) & (first >= -short), (first, middle, last, 0, 0)))
+    words.append(((LEFT, RIGHT, LEFT, 0, 0), near <= 4, (first, middle, last, 0, 0)))
     reach = np.sqrt(np.maximum(near * near - 4, 0))
     first = _within(bearing + portable.arctan2(reach, np.full_like(reach, -2.0)))
     last = _within(turn - QUARTER - first)
-    exists = (near >= 2) & (first >= -short) & (reach >= 2 - short) & (last <= short)
+    exists = (near >= 2) & (reach >= 2 - short)
     words.append(((LEFT, RIGHT, STRAIGHT, LEFT, 0), exists, (first, -QUARTER, 2 - reach, last, 0)))
     first = _polar(-other[1], other[0])[1]
     last = _within(first + QUARTER - turn)
-    exists = apart & (first >= -short) & (last <= short)
+    exists = apart
     words.append(((LEFT, RIGHT, STRAIGHT, RIGHT, 0), exists, (first, -QUARTER, 2 - far, last, 0)))
     return words
 

@@ -117,6 +117,13 @@ def test_the_shortest_free_curve_is_taken() -> None:
     assert max(chosen) > 0
 
 
+def test_a_car_that_has_driven_past_the_end_of_an_arc_goes_on() -> None:
+    """It does not turn back for another curve, again and again."""
+    start = [-0.9536, 1.1582, 1.9743, 0, 0]
+    problem = Problem(Team(("car",)), [start], [[0, 0]], goal_heading=np.pi / 2, horizon=300)
+    assert run_episode(navigation_v0.parallel_env(problem=problem), "go-to-goal").trajectory.arrived[-1].all()
+
+
 @pytest.mark.parametrize("policy", ["go-to-goal", "orca"])
 def test_cars_beside_a_wall_take_another_curve(policy: str) -> None:
     """By the shortest one this car would run into the wall; `orca` would stop before."""
