@@ -40,6 +40,7 @@ class Stream(IntEnum):
     DEMONSTRATIONS = 20  # of an expert, by round and episode
     TRAINING_INSTANCES = 21  # by part of the task mixture and number
     GUSTS = 22  # on drones in crazyflow
+    SHORTENING = 23  # steps that motions leave out, by iteration
 
 
 def derived_seed(seed: int, stream: Stream, *key: int) -> int:

@@ -11,9 +11,11 @@ from d4orm_env.core.world import World
 from d4orm_env.footprints import Box
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.manoeuvres.closing import gap_closer
 from d4orm_planners.manoeuvres.curves import NO_CURVES
 from d4orm_planners.manoeuvres.nodes import AHEAD
 from d4orm_planners.manoeuvres.search import curve_from, find_motion
+from d4orm_planners.manoeuvres.shortening import SHORTENED
 from d4orm_planners.manoeuvres.team import TeamMotions
 from d4orm_planners.mapf.lns import search_neighbourhoods
 
@@ -24,28 +26,38 @@ BETTER_ROUNDS = 16
 """Neighbourhoods that are replanned in an iteration once everybody has one."""
 
 
-def compile_manoeuvres() -> None:
-    """Compile the search, if it is not yet: it is the same for all models."""
-    if find_motion.signatures:
+def compile_manoeuvres(models: tuple[str, ...]) -> None:
+    """Compile what such a team needs, if it is not yet: the search is the same for all models."""
+    names = sorted({*models} & {*SHORTENED})
+    if find_motion.signatures and all(gap_closer(name).signatures for name in names):
         return
     world = World(boxes=[[0.5, 0.8, 0.6, 1.2]])
-    team = Team(("unicycle",) * 2, footprint=Box(0.4, 0.2))
-    problem = Problem(team, [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]], [[1.0, 0.0], [1.0, 2.0]], world, goal_heading=0.0)
-    motions = TeamMotions.prepared(problem, lambda: False)
-    assert motions is not None
-    motions.plan_all()
-    curve_from(NO_CURVES, motions.robots[0].task.goal, 0.0, 0.0, 0.0, AHEAD)
+    for name in names or ["unicycle"]:
+        team = Team((name,) * 2, footprint=Box(0.4, 0.2))
+        start = np.zeros((2, team.state_size))
+        start[:, 1:3] = [[0.0, 1.0], [2.0, 1.0]]
+        problem = Problem(team, start, [[1.0, 0.0], [1.0, 2.0]], world, goal_heading=0.0)
+        motions = TeamMotions.prepared(problem, lambda: False)
+        assert motions is not None
+        motions.plan_all()
+        motions.shorten([0], np.random.default_rng(0))
+        curve_from(NO_CURVES, motions.robots[0].task.goal, 0.0, 0.0, 0.0, AHEAD)
 
 
 def find_manoeuvres(search: SolveRun) -> TeamMotions | None:
     """Motions of the whole team, or of some robots if time is up; ``None`` if not all have one in the end."""
     with search.watch.paused():
-        compile_manoeuvres()
+        compile_manoeuvres(search.problem.team.models)
     motions = TeamMotions.prepared(search.problem, search.should_stop)
     if motions is None:
         return None
     motions.plan_all()
-    return motions if _complete(search, motions) or search.should_stop() else None
+    if not _complete(search, motions):
+        return motions if search.should_stop() else None
+    # Once more, for those that were in others' way are so no longer.
+    random, robots = np.random.default_rng(search.iteration_seed(Stream.SHORTENING)), range(len(motions.robots))
+    motions.shorten([*robots, *robots], random)
+    return motions
 
 
 def _complete(search: SolveRun, motions: TeamMotions) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.threads import Threads, available_cores
+from d4orm_planners.manoeuvres.closing import ends_of
 from d4orm_planners.manoeuvres.detours import anywhere, starting_from, without_goal
 from d4orm_planners.manoeuvres.fixed_path import on_fixed_path
 from d4orm_planners.manoeuvres.lattice import buffer_size
@@ -19,6 +20,7 @@ from d4orm_planners.manoeuvres.nodes import Nodes
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 from d4orm_planners.manoeuvres.robots import ManoeuvreScene, Robot, make_robot, scene_of
 from d4orm_planners.manoeuvres.search import PAUSED, Motion, find_motion, motion_to
+from d4orm_planners.manoeuvres.shortening import SHORTENED, shortened
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meets_nobody, traffic_of
 from d4orm_planners.mapf.lns import Odds
 from d4orm_planners.tracking.steering import advanced
@@ -173,6 +175,8 @@ class TeamMotions:
             if self.detours and (detour := self._detour(order[0], random)) is not None:
                 self._take(order.pop(0), detour)
             self._plan_in_turn(order, held, delay)
+            if cost[0] == self.missing == 0:
+                self.shorten(group.tolist(), random)
             if self.cost > cost:
                 for robot, motion in enumerate(before):
                     self._take(robot, motion)
@@ -184,6 +188,17 @@ class TeamMotions:
             others = [other for other in range(len(self.motions)) if other != robot]
             later = {other: held.get(other, 0) for other in order[position + 1 :]}
             self._take(robot, self._find(robot, self._traffic(others, later), 0 if position else delay))
+
+    def shorten(self, robots: Iterable[int], random: np.random.Generator) -> None:
+        """Shorten the motions of some robots, one after the other, each among those of all others."""
+        for robot in robots:
+            own, motion, others = self.robots[robot], self.motions[robot], [*range(len(self.robots))]
+            if motion is None or own.model.name not in SHORTENED or self.should_stop():
+                continue
+            others.remove(robot)
+            start, ends = self.problem.start[robot], ends_of(self.problem, robot, own.task.goal)
+            traffic = self._traffic(others, {})
+            self._take(robot, shortened(own, start, ends, motion, traffic, self._nodes, random))
 
     def _detour(self, number: int, random: np.random.Generator) -> Motion | None:
         """A robot's motion by way of somewhere else, drawn at random, where it stands for a while; if one is found."""

@@ -71,3 +71,18 @@ def test_one_of_two_that_change_places_beside_a_bay_goes_into_it(model: str) -> 
     assert plan.verified
     assert (plan.iterations, plan.denoising_steps) == (1, 0)
     assert plan.trajectory.positions[..., 0].max() > 1.95
+
+
+def test_second_order_unicycles_that_change_places_turn_as_they_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The moves of a search turn, drive or stand: joined to a motion they take much longer than what is left of it."""
+    limits = {"max_speed": 0.5, "max_acceleration": 0.25, "max_turn_rate": 0.5}
+    own = {"max_turn_acceleration": 0.25}
+    team = Team(("unicycle2",) * 2, footprint=Box(0.5, 0.25), own_limits=own, **limits)
+    start, goal = [[1.0, 1.0, 0.5, 0.0, 0.0], [4.0, 1.0, 2.5, 0.0, 0.0]], [[4.0, 1.0], [1.0, 1.0]]
+    problem = Problem(team, start, goal, goal_heading=[0.5, 2.5], margin=0.02, horizon=400, arrival="stay")
+    plan = make_planner(engine="cpu").solve(problem, seed=0)
+    assert plan.verified
+    assert (plan.iterations, plan.denoising_steps) == (1, 0)
+    monkeypatch.setattr(team_motions, "SHORTENED", ())
+    joined = make_planner(engine="cpu").solve(problem, seed=0)
+    assert plan.metrics["travel_time"] < 0.7 * joined.metrics["travel_time"]
