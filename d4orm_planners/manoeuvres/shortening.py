@@ -50,7 +50,7 @@ def shortened(
     space.states[0], close_gap = start[: model.state_size], gap_closer(model.name)
     for _ in range(TRIES if motion.steps <= MAX_STEPS else 0):
         leave, steps = max(1, min(leave, len(controls) - 1)), 0
-        if failures == FAILURES or len(controls) == 1:
+        if failures == FAILURES or len(controls) < 2:
             break
         first = int(random.integers(len(controls) - leave))
         fewer = np.concatenate([controls[:first], controls[first + leave :]])

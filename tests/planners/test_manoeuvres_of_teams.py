@@ -77,9 +77,11 @@ def test_second_order_unicycles_that_change_places_turn_as_they_drive(monkeypatc
     """The moves of a search turn, drive or stand: joined to a motion they take much longer than what is left of it."""
     limits = {"max_speed": 0.5, "max_acceleration": 0.25, "max_turn_rate": 0.5}
     own = {"max_turn_acceleration": 0.25}
-    team = Team(("unicycle2",) * 2, footprint=Box(0.5, 0.25), own_limits=own, **limits)
-    start, goal = [[1.0, 1.0, 0.5, 0.0, 0.0], [4.0, 1.0, 2.5, 0.0, 0.0]], [[4.0, 1.0], [1.0, 1.0]]
-    problem = Problem(team, start, goal, goal_heading=[0.5, 2.5], margin=0.02, horizon=400, arrival="stay")
+    team = Team(("unicycle2",) * 3, footprint=Box(0.5, 0.25), own_limits=own, **limits)
+    start = np.zeros((3, 5))
+    start[:, :3] = [[1.0, 1.0, 0.5], [4.0, 1.0, 2.5], [2.5, 3.0, 0.0]]
+    goal = start[[1, 0, 2], :2]  # the last one is there
+    problem = Problem(team, start, goal, goal_heading=start[:, 2], margin=0.02, horizon=400, arrival="stay")
     plan = make_planner(engine="cpu").solve(problem, seed=0)
     assert plan.verified
     assert (plan.iterations, plan.denoising_steps) == (1, 0)
