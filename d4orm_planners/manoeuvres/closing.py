@@ -194,9 +194,9 @@ def _stepper(model: Model) -> Any:
 
 
 @cache
-def gap_closer(name: str) -> Kernel[[Ends, Floats, Space], bool]:
-    """The kernel of robots of a model: changes controls ``(T, m)`` so that they lead from the first state of the
-    workspace to the goal, and fills in the others; returns whether that worked.
+def gap_closer(name: str) -> Kernel[[Ends, Floats, int, Space], bool]:
+    """The kernel of robots of a model: changes controls ``(T, m)`` from a step on, so that they lead from the first
+    state of the workspace to the goal, and fills in the other states; returns whether that worked.
     """
     model = MODELS[name]
     step, n, m, d = _stepper(model), model.state_size, model.control_size, model.dimension
