@@ -123,10 +123,26 @@ def steps_to_solution(trial: Trial) -> int | None:
 
 def denoising_time_share(trial: Trial) -> float | None:
     """Share of the time to the first solution, or to the last better plan, that denoising took, where it is told."""
+    if _iteration_steps(json.loads(trial.config)) is None:  # of a planner that has no such steps
+        return 0.0
     first = next((best for best in trial.progress if best.solved), None)
     if first is None:
         return trial.denoising_time_share
     return 0.0 if first.steps == 0 else first.denoising
+
+
+def denoising_time_shares(trials: Sequence[Trial]) -> list[float]:
+    """:func:`denoising_time_share` of all plans; where some do not tell it of those that were timed.
+
+    Without a step it is 0 without timing too, but a mean over these and a few others would be too low.
+    """
+    plans = [trial for trial in trials if trial.progress]
+    shares = [denoising_time_share(trial) for trial in plans]
+    if None in shares:
+        shares = [
+            share for trial, share in zip(plans, shares) if any(best.denoising is not None for best in trial.progress)
+        ]
+    return [share for share in shares if share is not None]
 
 
 def denoising_of(history: Sequence[IterationRecord]) -> dict[str, float | None]:
@@ -141,13 +157,29 @@ def denoising_of(history: Sequence[IterationRecord]) -> dict[str, float | None]:
     }
 
 
+def text_of_told(values: Sequence[float | None], text: Callable[[Sequence[float]], str]) -> str:
+    """The text of the values that are told, with their number where that is not all; a dash where none is."""
+    told = [value for value in values if value is not None]
+    return f"{text(told)}{told_of(len(told), len(values))}" if told else "-"
+
+
+def told_of(told: int, total: int) -> str:
+    """What stands behind a number that only so many of the trials tell."""
+    return "" if told == total else f" ({told} of {total})"
+
+
 def denoising_columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Median of the denoising steps, and mean share of the time that they took; dashes where not all rows tell them."""
+    """Median of the denoising steps, and mean share of the time that they took, of the rows that tell them."""
     steps, shares = ([row.get(name) for row in rows] for name in ("denoising_steps", "denoising_time_share"))
     return {
-        "denoising steps": "-" if None in steps or not steps else f"{np.median(steps):g}",
-        "denoising, time": "-" if None in shares or not shares else f"{np.mean(shares):.0%}",
+        "denoising steps": text_of_told(steps, lambda told: f"{np.median(told):g}"),
+        "denoising, time": text_of_told(shares, lambda told: f"{np.mean(told):.0%}"),
     }
+
+
+def loop_steps(trial: Trial) -> int | None:
+    """Denoising steps in a loop of a controller, 0 of one that makes none; ``None`` of a plan."""
+    return None if trial.status else _iteration_steps(json.loads(trial.config)) or 0
 
 
 def is_solved(trial: Trial) -> bool:

@@ -13,7 +13,16 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.common import each_row, grouped, mean_text, save_table, study_parser, study_rows
+from examples.common import (
+    denoising_columns,
+    denoising_of,
+    each_row,
+    grouped,
+    mean_text,
+    save_table,
+    study_parser,
+    study_rows,
+)
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
@@ -38,7 +47,7 @@ def solve(team: tuple[str, int], seed: int, **settings: Any) -> dict[str, Any]:
     return {
         "scenario": scenario, "robots": num_robots, "seed": seed, "solved": plan.solved,
         "iterations": plan.iterations, "arrived_after": arrived[0] if arrived else None,
-        "not_arrived": last.num_not_arrived, "in_violation": last.num_margin_violated,
+        "not_arrived": last.num_not_arrived, "in_violation": last.num_margin_violated, **denoising_of(plan.history),
     }  # fmt: skip
 
 
@@ -60,6 +69,7 @@ def summary(rows: Rows) -> Rows:
                 "robots": robots,
                 "iterations until all arrive": median(arrived, len(of)),
                 "until solved": median([row["iterations"] for row in of if row["solved"]], len(of)),
+                **denoising_columns(of),
                 "solved": f"{len(of) - len(left)} of {len(of)}",
                 "all arrive and some collide": f"{len(colliding)} of {len(of)}",
                 "robots in violation": mean_text(colliding, ".3g"),

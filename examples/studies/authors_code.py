@@ -7,7 +7,7 @@
 Their program runs as it is, on its own circle, with 1024 samples as in the paper; only its warm-up is left out. It
 draws with standard deviations ``1 / alpha_bar - 1``, where the paper has the root of that, so it runs a second time
 with the root. "Solved" is the planner's own word, "verified" that of :func:`d4orm_env.verify` and the margin on its
-controls; iterations and travel times are means over the solutions.
+controls; iterations, denoising steps and travel times are means over the solutions.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ Solver = Callable[[Problem, int, int], tuple[np.ndarray, bool, int]]
 
 TEAMS: tuple[int, ...] = (8, 12, 16)
 MAX_ITERATIONS, NUM_SAMPLES = 30, 1024
+STEPS = 100
+"""Denoising steps of an iteration, by their code and by both presets."""
 PRESETS = {"d4orm, authors": "authors", "d4orm, paper": "paper"}
 """Presets by the labels of their rows."""
 
@@ -122,6 +124,7 @@ def summary(rows: list[Row]) -> list[Row]:
             {"robots": size, "planner": label, "solved": f"{len(solved)} of {len(own)}",
              "verified": f"{sum(row['verified'] for row in own)} of {len(own)}",
              "iterations": mean_text([row["iterations"] for row in solved], ".1f"),
+             "denoising steps": mean_text([STEPS * row["iterations"] for row in solved], ".0f"),
              "least, most": f"{min(row['iterations'] for row in own)}, {max(row['iterations'] for row in own)}",
              "travel time [s]": mean_text([row["travel_time"] for row in solved if row["verified"]])}
         )  # fmt: skip

@@ -21,7 +21,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.common import mean_text, plt, save_figure, save_table, solved_columns, study_trials, trials_parser
+from examples.common import (
+    loop_steps,
+    mean_text,
+    plt,
+    save_figure,
+    save_table,
+    solved_columns,
+    steps_to_solution,
+    study_trials,
+    text_of_told,
+    trials_parser,
+)
 from examples.studies import FIRST_SEED
 
 from d4orm_env.disturbances import (
@@ -109,6 +120,7 @@ def rows_of(cells: Cells) -> list[dict[str, Any]]:
     for (scenario, policy, disturbance), trials in cells.items():
         rows.append(
             {"scenario": scenario, "policy": policy, "disturbance": disturbance, "trials": len(trials),
+             "denoising steps": denoising_steps(trials),
              "succeeded": sum(trial.success for trial in trials),
              "interval": solved_columns(trials, lambda trial: trial.success)["interval"],
              "touched": sum(trial.collided > 0 for trial in trials),
@@ -116,6 +128,14 @@ def rows_of(cells: Cells) -> list[dict[str, Any]]:
              "errors": sum(bool(trial.error) for trial in trials)}
         )  # fmt: skip
     return rows
+
+
+def denoising_steps(trials: Sequence[Trial]) -> str:
+    """Median of the denoising steps of plans, or those of a controller in a loop."""
+    in_loop = loop_steps(trials[0])
+    if in_loop is None:
+        return text_of_told([steps_to_solution(trial) for trial in trials], lambda told: f"{np.median(told):g}")
+    return f"{in_loop} a loop" if in_loop else "0"
 
 
 def successes(trials: Sequence[Trial]) -> str:
@@ -127,7 +147,8 @@ def overview(cells: Cells) -> list[dict[str, Any]]:
     """A row per scenario and policy: how many trials succeeded under each disturbance, and in how many was contact."""
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     for (scenario, policy, disturbance), trials in cells.items():
-        row = rows.setdefault((scenario, policy), {"scenario": scenario, "policy": policy, "trials": len(trials)})
+        told = {"trials": len(trials), "denoising steps": denoising_steps(trials)}
+        row = rows.setdefault((scenario, policy), {"scenario": scenario, "policy": policy, **told})
         row.update({name: row.get(name, "-") for name in COLUMNS})
         row[disturbance] = successes(trials)
     return list(rows.values())

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.common import grouped, save_table, study_parser, study_rows
+from examples.common import denoising_columns, denoising_of, grouped, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, load_dynobench
 from d4orm_env.scenarios import load_cl_mapf
@@ -59,7 +59,7 @@ def row_of(benchmark: str, path: Path, seed: int, load: Callable[[Path], Problem
     problem = loaded(path, load)
     row: dict[str, Any] = {"benchmark": benchmark, "instance": path.stem, "seed": seed, "refused": ""}
     row |= {"robots": 0, "models": "", "solved": False}
-    row |= {"seconds": np.nan, "makespan": np.nan, "sum_of_costs": np.nan}
+    row |= {"seconds": np.nan, "makespan": np.nan, "sum_of_costs": np.nan, **dict.fromkeys(denoising_of([]))}
     if isinstance(problem, str):
         return row | {"refused": problem}
     row |= {"robots": problem.num_robots, "models": ", ".join(sorted(set(problem.team.models)))}
@@ -67,7 +67,7 @@ def row_of(benchmark: str, path: Path, seed: int, load: Callable[[Path], Problem
     if plan.solved and plan.verified:
         arrivals = problem.dt * plan.trajectory.arrived.argmax(axis=0)
         row |= {"solved": True, "makespan": float(arrivals.max()), "sum_of_costs": float(arrivals.sum())}
-    return row | {"seconds": plan.wall_time}
+    return row | {"seconds": plan.wall_time, **denoising_of(plan.history)}
 
 
 def main() -> None:
@@ -125,7 +125,7 @@ def described(benchmark: str, kind: str, rows: list[dict[str, Any]]) -> dict[str
     return {
         "benchmark": benchmark, "instances": kind, "files": len({row["instance"] for row in rows}),
         "robots": " to ".join(map(str, robots[:: max(len(robots) - 1, 1)])), "models": ", ".join(models),
-        "solved": f"{len(solved)} of {len(rows)}", "planning [s]": median("seconds"),
+        "solved": f"{len(solved)} of {len(rows)}", **denoising_columns(rows), "planning [s]": median("seconds"),
         "longest [s]": f"{max(row['seconds'] for row in rows):.1f}",
         "makespan [s]": median("makespan"), "sum of costs [s]": median("sum_of_costs"),
     }  # fmt: skip

@@ -29,7 +29,18 @@ from math import comb
 from typing import Any
 
 import numpy as np
-from examples.common import count, mean_text, plt, require, save_figure, save_table, study_parser, study_rows
+from examples.common import (
+    count,
+    denoising_columns,
+    denoising_of,
+    mean_text,
+    plt,
+    require,
+    save_figure,
+    save_table,
+    study_parser,
+    study_rows,
+)
 from examples.studies import AS_IN_THE_PAPER
 
 require("ipopt", "casadi")
@@ -96,7 +107,8 @@ def solve(problem: Problem, seeds: int, **limits: Any) -> list[dict[str, Any]]:
             )
             rows.append(
                 {"planner": label, "seed": seed, "solved": solved, "robots": problem.num_robots,
-                 "travel_time": plan.metrics["travel_time"] if solved else None, "positions": positions}
+                 "travel_time": plan.metrics["travel_time"] if solved else None, "positions": positions,
+                 **denoising_of(plan.history)}
             )  # fmt: skip
         print(f"{label}: {sum(row['solved'] for row in rows[-seeds:])} of {seeds} seeds solved", flush=True)
     return rows
@@ -171,9 +183,10 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
         line = {"top to bottom": name, "signs": " ".join("+" if sign > 0 else "-" for sign in signs)}
         for label, found in classes.items():
             pairs = zip(solutions(rows, label), found, strict=True)
-            times = [row["travel_time"] for row, of in pairs if of == signs]
-            line[f"{label}: plans"] = str(len(times))
-            line[f"{label}: travel time [s]"] = mean_text(times, none="")
+            own = [row for row, of in pairs if of == signs]
+            line[f"{label}: plans"] = str(len(own))
+            line |= {f"{label}: {name}": value for name, value in denoising_columns(own).items()}
+            line[f"{label}: travel time [s]"] = mean_text([row["travel_time"] for row in own], none="")
         table.append(line)
     return table
 
@@ -200,6 +213,7 @@ def row_of(label: str, plans: Sequence[Row], trials: int) -> dict[str, Any]:
     return {
         "planner": label,
         "solved": f"{len(plans)} of {trials}",
+        **denoising_columns(plans),
         "classes": len(set(classes)),
         f"classes of {DRAWN} plans": f"{rarefied(classes, DRAWN):.1f}" if len(plans) >= DRAWN else "-",
         "pairs of one class": f"{same / len(pairs):.0%}" if pairs else "-",

@@ -16,10 +16,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from examples.common import grouped, require, save_table, study_parser, study_rows
+from examples.common import denoising_columns, denoising_of, grouped, require, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem
-from d4orm_planners import Controller, make_planner
+from d4orm_planners import Controller, Plan, make_planner
 
 ROBOT, RATE, FIRST_SEED = "crazyflie", 100, 1000
 DISTURBED = {"gust": 0.02, "mass_factor": 1.05}
@@ -61,9 +61,8 @@ def problem_of(scenario: str, seed: int) -> Problem:
 SCENARIOS = ("swap of ten", "circle of eight", "figure of ten")
 
 
-def fly_plan(problem: Problem, seed: int, bodies: Any) -> Iterator[np.ndarray]:
+def fly_plan(problem: Problem, plan: Plan, bodies: Any) -> Iterator[np.ndarray]:
     """Robots in contact in each step of a plan; nothing where it is not solved."""
-    plan = make_planner().solve(problem, seed=seed, time_limit=60)
     if not plan.solved:
         return
     sampled = plan.sample(rate=RATE)
@@ -93,7 +92,12 @@ def fly(scenario: str, condition: str, seed: int) -> dict[str, Any]:
     problem, mode = problem_of(scenario, seed), condition.partition(",")[0]
     bodies = DroneBodies(problem, np.zeros(0, np.float32), DronePhysics(**CONDITIONS[condition]))
     bodies.begin(seed)
-    steps = fly_plan(problem, seed, bodies) if mode == "open loop" else fly_controller(problem, seed, bodies, mode)
+    denoising: dict[str, float | None] = dict.fromkeys(denoising_of([]))  # not told of a controller
+    if mode == "open loop":
+        plan = make_planner().solve(problem, seed=seed, time_limit=60)
+        steps, denoising = fly_plan(problem, plan, bodies), denoising_of(plan.history)
+    else:
+        steps = fly_controller(problem, seed, bodies, mode)
     touched, arrived = np.zeros((2, problem.num_robots), np.bool_)
     for touching in steps:
         touched |= touching
@@ -107,7 +111,7 @@ def fly(scenario: str, condition: str, seed: int) -> dict[str, Any]:
         "contacts": int((touched & ~record.fallen).sum()),
         "mean_squared_error": float(record.mean_squared_error.mean()), "error": float(record.largest_error.max()),
         "gap": float(record.least_gap.min()), "clearance": float(record.least_clearance.min()),
-        "radius": float(problem.team.radius[0]), "seconds": record.samples / RATE,
+        "radius": float(problem.team.radius[0]), "seconds": record.samples / RATE, **denoising,
     }  # fmt: skip
 
 
@@ -127,7 +131,7 @@ def row_of(scenario: str, condition: str, rows: Sequence[dict[str, Any]]) -> dic
     drones = sum(row["robots"] for row in flown)
     rms = np.sqrt(np.mean([row["mean_squared_error"] for row in flown]))
     return {
-        "scenario": scenario, "flown": condition, "teams": f"{len(flown)} of {len(rows)}",
+        "scenario": scenario, "flown": condition, **denoising_columns(rows), "teams": f"{len(flown)} of {len(rows)}",
         "arrived": f"{sum(row['arrived'] for row in flown)} of {drones}",
         "in contact": sum(row["contacts"] for row in flown), "fallen": sum(row["fallen"] for row in flown),
         "error RMS [m]": f"{rms:.3f}",

@@ -321,6 +321,7 @@ def test_samples_are_counted_for_every_setting(tmp_path: Path) -> None:
 def test_arrivals_are_counted_by_iterations(tmp_path: Path) -> None:
     (row,) = made("arrivals", tmp_path)
     assert (row["robots"], row["iterations until all arrive"], row["solved"]) == ("2", "1", "1 of 1")
+    assert row["denoising steps"] == "10"
 
 
 def test_turned_samples_are_compared_with_others(tmp_path: Path) -> None:
@@ -475,6 +476,7 @@ def test_the_authors_code_runs_from_a_checkout(tmp_path: Path, shift: float) -> 
         "their code": ("1 of 1", "0 of 1"), "their code, the paper's deviations": ("1 of 1", "1 of 1"),
         "d4orm, authors": ("1 of 1", "1 of 1"), "d4orm, paper": ("1 of 1", "1 of 1"),
     }  # fmt: skip
+    assert rows["their code"]["denoising steps"] == "100", "of one iteration"
     check_made_again("authors_code", tmp_path, list(rows.values()))
 
 
@@ -553,8 +555,8 @@ def test_rivals_meet_the_same_seeds_tuned_and_as_the_paper_has_them(tmp_path: Pa
 def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
     out, rows = tmp_path / "out", made("disturbance_study", tmp_path)
     assert len({row["disturbance"] for row in rows}) == len(rows) == 13
-    assert {(row["scenario"], row["policy"], row["trials"], row["errors"]) for row in rows} == {
-        ("circle", "orca", "1", "0")
+    assert {(row["scenario"], row["policy"], row["trials"], row["denoising steps"], row["errors"]) for row in rows} == {
+        ("circle", "orca", "1", "0", "0")
     }
     assert (out / "disturbance_study.png").read_bytes().startswith(PNG)
     check_made_again("disturbance_study", tmp_path, rows)
@@ -680,6 +682,7 @@ def test_planners_find_several_kinds_of_solution_for_a_team(tmp_path: Path) -> N
     assert planners == ["d4orm", "d4orm, preset paper", "ipopt"]
     assert {label.rsplit(", ", 1)[0] for label in alike} in (set(), set(planners[1:])), "both, or none"
     assert rows["d4orm"]["solved"] == "4 of 4", "every seed solves so easy a problem"
+    assert [rows[label]["denoising steps"] for label in planners] == ["100", "100", "0"]
     assert all(1 <= int(row["classes"]) <= int(row["solved"].split()[0]) for row in rows.values())
     assert (out / "multimodality_team.png").read_bytes().startswith(PNG)
 

@@ -341,11 +341,39 @@ def test_denoising_has_columns_where_a_row_tells_of_it(tmp_path: Path) -> None:
     assert rows[0] == {"denoising_steps": 100, "denoising_time_share": 0.25}, "to the first solution"
     assert denoising_columns(rows) == {"denoising steps": "50", "denoising, time": "25%"}
     untold = {"denoising steps": "-", "denoising, time": "-"}
-    assert denoising_columns([*rows, {}]) == untold
+    assert denoising_columns([{}]) == untold
+    assert denoising_columns([*rows, {}]) == {"denoising steps": "50 (3 of 4)", "denoising, time": "25% (3 of 4)"}
     table = [{"planner": "a", **denoising_columns(rows)}, {"planner": "b", **untold}]
     for shown, head in ((table, "planner,denoising steps,"), (table[1:], "planner\n")):
         save_table(shown, tmp_path / "table.csv")
         assert (tmp_path / "table.csv").read_text().replace("\r", "").startswith(head)
+
+
+def test_the_share_of_time_is_of_trials_that_were_timed_where_some_were_not() -> None:
+    points = ("100,0.9", "100,0.9", "0", "100")
+    *timed, without_steps, untold = (
+        trial(seed, config='{"num_steps": 100}', history=f"[[0.5,1,0.5,{point}]]") for seed, point in enumerate(points)
+    )
+    text = METRICS["denoising_time_share"].text
+    assert text(measured(Group("Circle", "hybrid", [*timed, without_steps]))) == "60"
+    assert text(measured(Group("Circle", "hybrid", [*timed, without_steps, untold]))) == "90 (2 of 4)"
+    assert text(measured(Group("Circle", "hybrid", [untold]))) == "-"
+    old = trial(0, policy="amswarm", config="{}", status="time_limit", history="[[0.5,0,0.5]]")
+    assert text(measured(Group("Circle", "amswarm", [old]))) == "0", "it makes no steps"
+
+
+def test_the_steps_of_a_plan_are_told_whatever_noise_makes_of_it() -> None:
+    failed = trial(control_noise_std=0.1, success=False, history="[[0.5,1,0.5,100]]")
+    row = measured(Group("Circle", "d4orm", [failed]))
+    assert [METRICS[name].text(row) for name in ("first_steps", "runtime")] == ["100 (100-100)", "-"]
+
+
+def test_controllers_tell_the_denoising_steps_of_a_loop() -> None:
+    config = '{"num_steps": 20}'
+    driven = measured(Group("Circle", "d4orm-c2f", [trial(config=config, status="", history="[]", iterations=None)]))
+    assert METRICS["first_steps"].text(driven) == "20 a loop"
+    reacting = trial(policy="orca", config="{}", status="", history="[]", iterations=None)
+    assert METRICS["first_steps"].text(measured(Group("Circle", "orca", [reacting]))) == "-"
 
 
 def test_what_is_never_can_be_drawn(tmp_path: Path) -> None:

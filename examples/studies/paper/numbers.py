@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from examples.common import denoising_time_share, steps_spent, steps_to_solution
+from examples.common import denoising_time_shares, loop_steps, steps_spent, steps_to_solution, told_of
 from examples.studies.paper.figure import TIMES, Figure, Group
 
 from d4orm_planners.evaluation.store import Trial
@@ -35,7 +35,9 @@ class Measured(Compared):
     first_steps_lower: float | None  # and quartiles
     first_steps_upper: float | None
     first_steps_restricted: float | None  # mean over all trials, of which those that failed count all their steps
-    denoising_time_share: float | None  # of the time to the first solution, or of all spent, where all trials tell it
+    first_steps_loop: int | None  # of a loop of a controller
+    denoising_time_share: float | None  # of the time to the first solution, or of all spent, mean of those that tell it
+    denoising_time_told: int  # how many these are
     iterations: float | None  # none of policies that execute no plan
     iterations_restricted: float | None  # mean over all trials, of which those that failed count all that they made
     reward: float | None  # of the last best plan, per step of the horizon and robot, over all trials
@@ -79,6 +81,7 @@ def measured(group: Group) -> Measured:
     all_steps = [steps_to_solution(trial) for trial in trials]
     fewer, steps, more = _quartiles(all_steps)
     average, deviation = _mean_and_deviation([seconds for _, seconds in solved])
+    shares = denoising_time_shares(trials)
 
     def mean(name: str) -> float | None:
         values = [value for trial, _ in solved if (value := getattr(trial, name)) is not None]
@@ -92,7 +95,9 @@ def measured(group: Group) -> Measured:
         runtime_restricted=_restricted(times, [trial.wall_time for trial in trials]),
         first_steps=steps, first_steps_lower=fewer, first_steps_upper=more,
         first_steps_restricted=_restricted(all_steps, [steps_spent(trial) for trial in trials]),
-        denoising_time_share=mean_if_known([denoising_time_share(trial) for trial in trials if trial.progress]),
+        first_steps_loop=loop_steps(trials[0]),
+        denoising_time_share=mean_if_known(shares),
+        denoising_time_told=len(shares),
         iterations_restricted=_restricted([trial.iterations for trial in trials], times),
         reward=float(np.mean(rewards)) if rewards else None,
         jerk=mean("mean_squared_jerk"),
@@ -153,15 +158,22 @@ def _success(row: Measured) -> str:
 
 def _spread(name: str, digits: int) -> Callable[[Measured], str]:
     def text(row: Measured) -> str:
-        quartiles = (getattr(row, name + end) for end in ("_lower", "", "_upper"))
+        quartiles = [getattr(row, name + end) for end in ("_lower", "", "_upper")]
         lower, middle, upper = (NEVER if value is None else f"{value:.{digits}f}" for value in quartiles)
-        return f"{middle} ({lower}-{upper})" if row.successes else "-"
+        return f"{middle} ({lower}-{upper})" if row.successes or quartiles[0] is not None else "-"
 
     return text
 
 
 def _steps(row: Measured) -> str:
-    return "-" if row.first_steps_restricted is None else _spread("first_steps", 0)(row)
+    if row.first_steps_restricted is not None:
+        return _spread("first_steps", 0)(row)
+    return f"{row.first_steps_loop} a loop" if row.first_steps_loop else "-"
+
+
+def _time_share(row: Measured) -> str:
+    share = row.denoising_time_share
+    return "-" if share is None else f"{100 * share:.0f}{told_of(row.denoising_time_told, row.trials)}"
 
 
 def _mean_runtime(row: Measured) -> str:
@@ -175,7 +187,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType({
     "mean_runtime": Metric("runtime, s", _mean_runtime),
     "first_steps": Metric("denoising steps", _steps),
     "first_steps_restricted": Metric("denoising steps, restricted mean", _number("first_steps_restricted", 0)),
-    "denoising_time_share": Metric("denoising, % of time", _number("denoising_time_share", 0, 100)),
+    "denoising_time_share": Metric("denoising, % of time", _time_share),
     "iterations": Metric("iterations", _number("iterations", 1)),
     "iterations_restricted": Metric("iterations, restricted mean", _number("iterations_restricted", 1)),
     "reward": Metric("reward", _number("reward", 3)),
