@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, SMALLEST, Floats, positive_number, short_repr
+from d4orm_env.core.arrays import LARGEST, SMALLEST, Floats, numbers_of, positive_number, real_number, short_repr
 
 __all__ = ["Box", "Capsule", "Disc", "Ellipsoid", "Footprint", "Polygon", "Train"]
 
@@ -76,16 +76,11 @@ class Footprint(ABC):
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():  # type: ignore[call-overload] # all are dataclasses
             title = f"{name} of {type(self).__name__}"
-            if name != "offset" and not isinstance(value, str | bytes):
-                number = positive_number(value, title, least=SMALLEST, most=LARGEST)
-            elif (
-                isinstance(value, int | float | np.number)
-                and not isinstance(value, bool)
-                and abs(float(value)) <= LARGEST
-            ):
-                number = float(value)
-            else:
-                raise ValueError(f"{title} must be a number of metres, not {short_repr(value)}")
+            number = real_number(value, title)
+            if name != "offset":
+                positive_number(number, title, least=SMALLEST, most=LARGEST)
+            elif not abs(number) <= LARGEST:
+                raise ValueError(f"{title} is {number:g}; it must be at most {LARGEST:g} m in magnitude")
             object.__setattr__(self, name, number)  # one kind of number in files and comparisons
 
 
@@ -199,11 +194,7 @@ class Polygon(Planar):
     corners: tuple[tuple[float, float], ...]
 
     def __init__(self, corners: ArrayLike) -> None:
-        try:
-            text = any(isinstance(value, str | bytes | bool) for value in np.array(corners, object).flat)
-            table = np.array("none" if text else corners, np.float64)  # which raises
-        except (TypeError, ValueError):
-            raise ValueError(f"corners of Polygon must be rows of two numbers, not {short_repr(corners)}") from None
+        table: Floats = numbers_of(corners, "corners of Polygon must be rows of two numbers", np.float64)
         if table.ndim != 2 or table.shape[1] != 2 or not 3 <= len(table) <= MAX_CORNERS:
             raise ValueError(f"corners of Polygon have shape {table.shape}; expected (n, 2), n from 3 to {MAX_CORNERS}")
         if not np.isfinite(table).all() or np.abs(table).max() > LARGEST:

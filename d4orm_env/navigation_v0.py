@@ -93,14 +93,20 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
 
     def observation_space(self, agent: str) -> gymnasium.spaces.Box:
         """``(D,)`` float32 box, the same for all agents."""
-        return self.observation_spaces[agent]
+        return self._space(self.observation_spaces, agent)
 
     def action_space(self, agent: str) -> gymnasium.spaces.Box:
         """``(m,)`` float32 box of the team's largest control limits, the same for all agents, in physical units.
 
         The step clips every control to the robot's own limits.
         """
-        return self.action_spaces[agent]
+        return self._space(self.action_spaces, agent)
+
+    def _space(self, spaces: Mapping[str, gymnasium.spaces.Box], agent: str) -> gymnasium.spaces.Box:
+        if agent not in self.possible_agents:
+            last = self.possible_agents[-1]
+            raise ValueError(f"agent {short_repr(agent)} is unknown; the agents are robot_0 to {last}")
+        return spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, object] | None = None
@@ -257,6 +263,10 @@ class AECNavigationEnv(parallel_to_aec_wrapper):
         """Show agents the world as it is now, before all have chosen."""
         self._observations = {**self._observations, **observations}
         self.infos = {**self.infos, **infos}
+
+    def observe(self, agent: str) -> FloatArray:
+        self.observation_space(agent)  # which refuses an unknown one
+        return super().observe(agent)
 
     def step(self, action: FloatArray | None) -> None:
         agent = self.agent_selection

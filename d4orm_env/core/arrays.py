@@ -35,49 +35,42 @@ def read_only(arrays: A) -> A:
     return arrays
 
 
-def as_float32(value: ArrayLike) -> FloatArray:
+def as_float32(value: ArrayLike, dtype: type = np.float32) -> FloatArray:
     """A new float32 array of ``value``, PyTorch's tensors included; what is too large for float32 becomes infinite.
 
     What cannot be read as numbers, or is a whole number that no float holds, is a ValueError.
     """
     try:
         with np.errstate(over="ignore"):
-            return np.array(_detached(value), np.float32)
+            return np.array(_detached(value), dtype)
     except OverflowError:
         raise ValueError("it holds a whole number too large for a float") from None
     except (RuntimeError, TypeError, ValueError):
-        raise ValueError("it does not hold numbers only, in rows of one length") from None
+        raise ValueError("it does not hold numbers only, in rows of one length; text and True are none") from None
 
 
 def _detached(value: Any) -> Any:
     """``value`` with PyTorch's tensors, in a list too, as arrays, whatever their device and gradients."""
     # What most calls are for, in every step of an environment.
-    if isinstance(value, float | int) or (isinstance(value, np.ndarray) and value.dtype.kind == "f"):
+    if isinstance(value, float) or (isinstance(value, np.ndarray) and value.dtype.kind == "f"):
         return value
-    if hasattr(value, "detach"):
-        # In double precision NumPy has all their types.
-        return value.detach().cpu().double().numpy()
     if isinstance(value, list | tuple):
         return [_detached(part) for part in value]
-    # NumPy would drop imaginary parts, and read text and times as numbers.
-    if isinstance(value, str | bytes) or (isinstance(value, np.ndarray) and value.dtype.kind in "cSUmM"):
+    dtype = getattr(value, "dtype", None)
+    kind = getattr(dtype, "kind", str(dtype))
+    if kind == "O":
+        return _detached(value.tolist())
+    # NumPy would drop imaginary parts, and read text, times and truth values as numbers.
+    if isinstance(value, str | bytes | bool) or kind in ("b", "c", "S", "U", "m", "M", "torch.bool"):
         raise TypeError("these are no real numbers")
-    return value
+    # In double precision NumPy has all of PyTorch's types.
+    return value.detach().cpu().double().numpy() if hasattr(value, "detach") else value
 
 
-def _holds_truth(value: Any) -> bool:
-    """Check for truth values, in lists too."""
-    if isinstance(value, list | tuple):
-        return any(map(_holds_truth, value))
-    return isinstance(value, bool) or getattr(value, "dtype", None) == np.bool_
-
-
-def numbers_of(value: ArrayLike, what: str) -> FloatArray:
+def numbers_of(value: ArrayLike, what: str, dtype: type = np.float32) -> Any:
     """:func:`as_float32` of what a user gave; the error says ``what`` is wanted, as ``"goal must be numbers"``."""
-    if _holds_truth(value):
-        raise ValueError(f"{what}, not {short_repr(value)}; True and False are no numbers")
     try:
-        return as_float32(value)
+        return as_float32(value, dtype)
     except ValueError as error:
         raise ValueError(f"{what}, not {short_repr(value)}; {error}") from error
 
@@ -198,10 +191,8 @@ def short_repr(value: object) -> str:
 def number_list(given: object, name: str, count: int | None = None) -> Floats:
     """A list of finite numbers in a file, or one number; the first ``count`` of them, where so many are wanted."""
     try:
-        if any(isinstance(value, bool) for value in (given if isinstance(given, list) else [given])):
-            raise TypeError("truth is no number")
-        numbers = np.atleast_1d(np.array(given, np.float64))
-    except (TypeError, ValueError):
+        numbers = np.atleast_1d(numbers_of(given, name, np.float64))  # type: ignore[arg-type] # what is none raises
+    except ValueError:
         numbers = np.zeros((0, 0))
     if numbers.ndim != 1 or len(numbers) < (count or 0):
         wanted = "be a list of numbers, as [1.0, 2.5]" if count is None else f"have numbers, {count} of them"
@@ -209,6 +200,16 @@ def number_list(given: object, name: str, count: int | None = None) -> Floats:
     if not (abs(numbers) <= LARGEST).all():
         raise ValueError(f"{name} is {short_repr(given)}; all must be numbers of at most {LARGEST:g}")
     return numbers[:count]
+
+
+def real_number(value: object, name: str) -> float:
+    """``value`` as a float; a ValueError if it is no number, as text and truth values are none."""
+    try:
+        return float(_detached(value))
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a number, not {short_repr(value)}") from error
+    except OverflowError:
+        return np.inf if value > 0 else -np.inf  # type: ignore[operator] # a whole number
 
 
 def positive_number(
@@ -220,14 +221,7 @@ def positive_number(
         ValueError: If it is not a number, not finite, negative, zero where zero is not allowed, below ``least`` or
             above ``most``.
     """
-    try:
-        if isinstance(value, bool | np.bool_):
-            raise TypeError("truth is no number")
-        number = float(value)  # type: ignore[arg-type] # what is none raises
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a number, not {short_repr(value)}") from error
-    except OverflowError:
-        number = np.inf if value > 0 else -np.inf  # type: ignore[operator] # a whole number
+    number = real_number(value, name)
     if not np.isfinite(number) or number < 0 or (number == 0 and not zero_allowed):
         raise ValueError(
             f"{name} is {number:g}; it must be {'zero or more' if zero_allowed else 'positive'} and finite"

@@ -16,6 +16,10 @@ class MissingFileError(ValueError, FileNotFoundError):
     """A file that does not exist: a FileNotFoundError, as Python raises, and bad input like any other."""
 
 
+class FileAccessError(ValueError, OSError):
+    """A file that the system does not read or write: an OSError, as Python raises, and bad input like any other."""
+
+
 def first_line(error: BaseException) -> str:
     """The first line of the message, or the kind of an error without one."""
     return next(iter(str(error).splitlines()), type(error).__name__)

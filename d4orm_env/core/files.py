@@ -21,7 +21,7 @@ from typing import IO, Any
 import numpy as np
 import yaml
 
-from d4orm_env.core.errors import MissingFileError
+from d4orm_env.core.errors import FileAccessError, MissingFileError
 
 
 def checked_path(path: object, what: str) -> Path:
@@ -80,17 +80,31 @@ def _unreadable(error: OSError, where: str = "") -> ValueError:
 
 
 def target_of(path: Path) -> Path:
-    """Path at which a file is written: its own, or a symbolic link's target. Raises OSError if no file can be there."""
+    """Path at which a file is written: its own, or a symbolic link's target. Raises FileAccessError if it cannot be."""
     target = Path(os.path.realpath(path))
     if target.is_symlink():
-        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+        raise FileAccessError(f"{path}: {os.strerror(errno.ELOOP)}; give the name of a file")
     if not target.parent.is_dir():
-        raise FileNotFoundError(f"folder {target.parent} does not exist; create it, or write {path.name} elsewhere")
+        raise MissingFileError(f"folder {target.parent} does not exist; create it, or write {path.name} elsewhere")
     if target.is_dir():
-        raise IsADirectoryError(f"{path} is a folder; give the name of a file")
+        raise FileAccessError(f"{path} is a folder; give the name of a file")
     if target.exists() and not target.is_file():
-        raise OSError(f"{path} is a device or a pipe; give the name of a file")
+        raise FileAccessError(f"{path} is a device or a pipe; give the name of a file")
     return target
+
+
+@contextmanager
+def writing(path: Path, *parts: object) -> Iterator[None]:
+    """Raise errors of the system on ``path``, on these ``parts`` of it if there are any, or on no file in particular,
+    as a FileAccessError that names it.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None or (parts and error.filename not in (None, *parts)):
+            raise
+        reason = f"{path} cannot be written: {error.strerror}"
+        raise FileAccessError(f"{reason}; free some space or choose another folder") from error
 
 
 @contextmanager
@@ -98,7 +112,7 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
     """Give a temporary path in the same folder; rename it to ``path`` at the end, or remove it after an error.
 
     A symbolic link stays one. A path that ends in none of the ``suffixes``, if there are any, is a ValueError, and one
-    that cannot be written to an OSError that names it.
+    that cannot be written to an FileAccessError that names it.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         raise ValueError(f"{path} ends in {path.suffix!r}; choose one of {', '.join(suffixes)}")
@@ -106,19 +120,13 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
     # Of a long name a part, because it must not become longer than a name may be.
     temporary = target.with_name(f".{path.stem[:32]}.{os.getpid()}.{time.monotonic_ns()}{path.suffix[:16]}")
     try:
-        try:
-            temporary.touch(exist_ok=False)
-        except OSError as error:
-            raise type(error)(f"cannot write to folder {target.parent}: {error.strerror}") from error
-        yield temporary
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())  # or a power cut may leave the new name with nothing in it
-        temporary.replace(target)
-    except OSError as error:
         # A full disk names no file, and others the temporary one.
-        if error.errno is not None and error.filename in (None, str(temporary), temporary):
-            error.filename = str(path)
-        raise
+        with writing(path, temporary, str(temporary)):
+            temporary.touch(exist_ok=False)
+            yield temporary
+            with temporary.open("rb+") as file:
+                os.fsync(file.fileno())  # or a power cut may leave the new name with nothing in it
+            temporary.replace(target)
     finally:
         with suppress(OSError):  # a folder that is read-only refuses before it looks
             temporary.unlink(missing_ok=True)

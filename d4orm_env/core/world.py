@@ -10,7 +10,17 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, Floats, Frozen, frozen_array, read_only, short_repr
+from d4orm_env.core.arrays import (
+    LARGEST,
+    SMALLEST,
+    FloatArray,
+    Floats,
+    Frozen,
+    frozen_array,
+    numbers_of,
+    read_only,
+    short_repr,
+)
 from d4orm_env.geometry.polygon import MAX_ALL_CORNERS, check_polygon, triangulate
 from d4orm_env.geometry.shapes import Shapes
 from d4orm_env.geometry.world_index import WorldIndex, build_index, is_farther, nearest_distance
@@ -207,7 +217,7 @@ class World(Frozen):
         Returns:
             ``(...)`` distances; infinite in an empty open world.
         """
-        points = np.asarray(positions, np.float64)
+        points = self._points(positions)
         to_bounds = self._to_bounds(points)
         if not self.shapes.count:
             return to_bounds
@@ -225,12 +235,18 @@ class World(Frozen):
             positions: ``(..., dimension)``.
             distance: From the nearest obstacle or bound [m].
         """
-        points = np.asarray(positions, np.float64)
+        points = self._points(positions)
         clear: np.ndarray = self._to_bounds(points) > distance
         if self.shapes.count:
             index = self.index(distance)
             clear[clear] = is_farther(self.shapes, index, points[clear], distance)
         return clear
+
+    def _points(self, positions: ArrayLike) -> Floats:
+        points: Floats = numbers_of(positions, "positions must be an array of numbers", np.float64)
+        if points.shape[-1:] != (self.dimension,):
+            raise ValueError(f"positions have shape {points.shape}; expected (..., {self.dimension})")
+        return points
 
     def _to_bounds(self, points: Floats) -> Floats:
         bounds = self.bounds.astype(np.float64)

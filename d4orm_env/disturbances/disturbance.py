@@ -244,7 +244,12 @@ def level(check: Check, default: object = MISSING, **neutral: object) -> Any:
 
 def unless(special: object, check: Check) -> Check:
     """The check of all values but a special one."""
-    return lambda value, name: value if value is special or value == special else check(value, name)
+
+    def checked(value: object, name: str) -> object:
+        same = value is special or (isinstance(value, float | np.floating) and value == special)
+        return value if same else check(value, name)
+
+    return checked
 
 
 def per_component(value: ArrayLike, name: str) -> float | tuple[float, ...]:

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST_NUMBER, BoolArray, FloatArray, Floats, IntArray, as_float32
+from d4orm_env.core.arrays import LARGEST_NUMBER, BoolArray, FloatArray, Floats, IntArray, numbers_of
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
@@ -133,10 +133,7 @@ class WorldBatch(NamedTuple):
 
 def checked_controls(problem: Problem, controls: ArrayLike, *, batch: bool = False) -> FloatArray:
     """``(H, K, m)`` controls as a contiguous float32 array, or with ``batch`` ``(M, H, K, m)``, with finite squares."""
-    try:
-        array = as_float32(controls)
-    except ValueError as error:
-        raise ValueError(f"controls must be an array of numbers; {error}") from None
+    array: FloatArray = numbers_of(controls, "controls must be an array of numbers")
     expected = (problem.horizon, problem.num_robots, problem.control_size)
     if array.ndim != 3 + batch or array.shape[batch:] != expected:
         asked = f"(M, H, K, m) = (M, {', '.join(map(str, expected))})" if batch else f"(H, K, m) = {expected}"

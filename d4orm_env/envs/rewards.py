@@ -245,7 +245,8 @@ def _all_checked(parts: Mapping[str, ArrayLike], expected: tuple[int, ...]) -> S
 
 def _checked(values: ArrayLike, name: str, expected: tuple[int, ...]) -> FloatArray:
     try:
-        rewards = as_float32(values)
+        # Of arrivals, as of all comparisons, NumPy has truth values.
+        rewards = as_float32(np.asarray(values, np.float32) if getattr(values, "dtype", None) == np.bool_ else values)
     except ValueError as error:
         raise ValueError(f"reward {name!r}: {error}") from error
     if rewards.shape != expected:

@@ -54,8 +54,9 @@ def save_animation(
         The path.
 
     Raises:
-        ValueError: For another suffix, ``.mp4`` without ffmpeg, or a number or trajectory that does not fit.
-        OSError: If the folder does not exist or cannot be written to, or ffmpeg fails.
+        ValueError: For another suffix, ``.mp4`` without ffmpeg, a number or trajectory that does not fit, or if it
+            cannot be written; nothing is left behind then.
+        OSError: If ffmpeg fails.
     """
     checked_trajectory(problem, trajectory)
     with replaced_when_done(path := checked_path(path, "an animation"), ANIMATION_SUFFIXES) as temporary:

@@ -233,8 +233,7 @@ def save_picture(
         The path.
 
     Raises:
-        ValueError: For another suffix, or as :func:`plot_trajectory`.
-        OSError: If the folder does not exist or cannot be written to.
+        ValueError: For another suffix, as :func:`plot_trajectory`, or if it cannot be written; nothing is left behind.
     """
     path = checked_path(path, "a picture")
     kind = path.suffix.lower()[1:]

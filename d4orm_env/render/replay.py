@@ -162,8 +162,7 @@ class Replay:
         """Write the page to an ``.html`` file.
 
         Raises:
-            ValueError: For another suffix.
-            OSError: If it cannot be written; nothing is left behind then.
+            ValueError: For another suffix, or if it cannot be written; nothing is left behind then.
         """
         with replaced_when_done(path := checked_path(path, "a replay"), REPLAY_SUFFIXES) as temporary:
             temporary.write_text(self.html, encoding="utf-8")

@@ -69,13 +69,8 @@ def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
     """
     check_is_problem(problem)
     target = checked_path(path, "a scenario file")
-    try:
-        with replaced_when_done(target) as temporary:
-            temporary.write_text(scenario_text(problem), encoding="utf-8")
-    except OSError as error:
-        raise ValueError(
-            f"{target}: cannot be written ({error.strerror or error}); choose a file in a folder you own"
-        ) from error
+    with replaced_when_done(target) as temporary:
+        temporary.write_text(scenario_text(problem), encoding="utf-8")
 
 
 def scenario_text(problem: Problem) -> str:

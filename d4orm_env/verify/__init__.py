@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core import portable
+from d4orm_env.core.arrays import numbers_of
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Stretch
 from d4orm_env.verify.curves import CHORD_ERROR
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
@@ -185,15 +186,9 @@ class _Course:
 
 
 def _checked_controls(problem: Problem, controls: ArrayLike) -> Floats:
-    try:
-        if np.iscomplexobj(controls):
-            raise TypeError("NumPy would drop the imaginary parts")
-        array = np.asarray(controls, np.float64)
-    except OverflowError as error:
-        raise ValueError("controls hold a whole number too large for float64; keep them within the limits") from error
-    except (TypeError, ValueError) as error:
-        remedy = "; give its controls" if hasattr(controls, "controls") else ""
-        raise ValueError(f"controls must be an array of numbers, not {type(controls).__name__}{remedy}") from error
+    if hasattr(controls, "controls"):
+        raise ValueError(f"controls must be an array of numbers, not {type(controls).__name__}; give its controls")
+    array: Floats = numbers_of(controls, "controls must be an array of numbers", np.float64)
     expected = (problem.horizon, len(problem.team.models), problem.team.control_size)
     if array.shape != expected:
         remedy = ""

@@ -101,8 +101,7 @@ class DisplayMixin:
             The path.
 
         Raises:
-            ValueError: For another suffix.
-            OSError: If it cannot be written; nothing is left behind then.
+            ValueError: For another suffix, or if it cannot be written; nothing is left behind then.
         """
         return self.animate().save(path)
 

@@ -190,9 +190,9 @@ class Plan(DisplayMixin):
             max_jerk: See :meth:`sample`.
 
         Raises:
-            ValueError: As :meth:`sample`; if there is no such format, or the motion does not fit it.
+            ValueError: As :meth:`sample`; if there is no such format, the motion does not fit it, or the files cannot
+                be written.
             ModuleNotFoundError: If the format needs a library that is missing.
-            OSError: If the files cannot be written.
         """
         folder = checked_path(path, "the folder of an export")
         return exports.export_motion(self._smooth(max_acceleration, max_jerk), format, folder, rate, height)
@@ -215,8 +215,7 @@ class Plan(DisplayMixin):
         """Write the motion as a result file of dynobench and db-CBS: states and actions of every robot.
 
         Raises:
-            ValueError: If a robot's model is none of theirs.
-            OSError: If it cannot be written; nothing is left behind then.
+            ValueError: If a robot's model is none of theirs, or it cannot be written; nothing is left behind then.
         """
         lines = list(dynobench.result_lines(self.problem, self.trajectory))
         with replaced_when_done(checked_path(path, "a result of dynobench")) as temporary:
@@ -226,8 +225,7 @@ class Plan(DisplayMixin):
         """Write the plan, its problem and its trajectory to an ``.npz`` file.
 
         Raises:
-            ValueError: If the path does not end in ``.npz``.
-            OSError: If it cannot be written; nothing is left behind then.
+            ValueError: If the path does not end in ``.npz``, or it cannot be written; nothing is left behind then.
         """
         plan_file.save_plan(self, path)
 

@@ -1,7 +1,7 @@
 """Settings as data: converted and checked once, when they are made, by the types of their fields.
 
-A field's type says what it may hold, as ``Annotated[Whole, Field(ge=1)]``; pydantic does the rest. Numbers may be given
-in any spelling that means one, text included, so that equal settings are equal and look alike wherever they are kept.
+A field's type says what it may hold, as ``Annotated[Whole, Field(ge=1)]``; pydantic does the rest. Numbers may be of
+any type, but no text; they are converted, so that equal settings are equal and look alike wherever they are kept.
 """
 
 from __future__ import annotations
@@ -11,40 +11,32 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import cache
 from types import MappingProxyType
-from typing import Annotated, Any, Self, SupportsFloat, get_type_hints
+from typing import Annotated, Any, Self, get_type_hints
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
 
-from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, LARGEST_WHOLE, short_repr
+from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, LARGEST_WHOLE, real_number, short_repr
 from d4orm_env.core.errors import UnknownKeywordError, no_setting, unknown
 from d4orm_env.engine.choice import ENGINES
 
 
 def _truth(value: object) -> object:
-    """NumPy's truth, which pydantic would take for a number, as Python's."""
-    return bool(value) if isinstance(value, np.bool_) else value
+    """NumPy's truth and text, which pydantic would take for numbers, as Python's."""
+    return value.tolist() if isinstance(value, np.bool_ | np.ndarray) else value
 
 
 def _whole(value: object) -> object:
-    """Text and NumPy's integers as an ``int``; anything else as it is, for pydantic to judge."""
-    try:
-        return int(value) if isinstance(value, str | np.integer) else _truth(value)
-    except ValueError:
-        return value
+    """NumPy's integers as an ``int``; anything else as it is, for pydantic to judge."""
+    return int(value) if isinstance(value, np.integer) else _truth(value)
 
 
 def _number(value: object) -> object:
     """Whatever means a number as a ``float``; anything else as it is, for pydantic to judge."""
-    value = _truth(value)
-    if isinstance(value, bool) or not isinstance(value, str | SupportsFloat):
-        return value
     try:
-        return float(value)
-    except OverflowError:
-        return float("inf")
-    except (TypeError, ValueError):
-        return value
+        return real_number(value, "")
+    except ValueError:
+        return _truth(value)
 
 
 def _path(value: object) -> object:

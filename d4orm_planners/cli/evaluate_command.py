@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
+from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.base.display import one_line
 from d4orm_planners.base.planner_registry import setting_names
 from d4orm_planners.cli.options import (
@@ -35,7 +36,7 @@ from d4orm_planners.evaluation.robustness import tolerance_tables, write_disturb
 from d4orm_planners.evaluation.store import TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import success_rates
-from d4orm_planners.evaluation.tables import PARQUET_HINT, markdown, read_parquet, target, write_results
+from d4orm_planners.evaluation.tables import PARQUET_HINT, markdown, read_parquet, write_results
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup
@@ -259,6 +260,6 @@ def leaderboard(
     )
     # A trial that several of them have is one.
     text = page([*{trial.key: trial for trial in trials}.values()], limits)
-    with target(out) as path:
+    with replaced_when_done(out) as path:
         path.write_text(text, encoding="utf-8")
     tell_written(out, quiet=quiet)

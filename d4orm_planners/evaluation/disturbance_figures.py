@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.disturbances.disturbance_registry import find_level, name_of
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import ACCELERATION
 from d4orm_env.render import own_style
 from d4orm_planners.evaluation.summary import SuccessRate
-from d4orm_planners.evaluation.tables import target
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,7 +103,7 @@ def write_figure(folder: Path, name: str, figure: Figure) -> list[Path]:
     """Write a figure as PDF, SVG and PNG. The same figure gives the same bytes."""
     paths = [folder / f"{name}.{kind}" for kind in KINDS]
     for path, kind in zip(paths, KINDS):
-        with target(path) as temporary, own_style(_STYLE):
+        with replaced_when_done(path) as temporary, own_style(_STYLE):
             figure.savefig(temporary, format=kind, dpi=300, metadata=_UNDATED.get(kind))
     return paths
 

@@ -89,9 +89,9 @@ def evaluate(
 
     Raises:
         ValueError: For an unknown name, a number that makes no sense, a policy of your own that worker processes cannot
-            import, or a store that is something else. Nothing has run then.
+            import, or a folder or store that is something else or cannot be written to. Nothing has run then.
         ImportError: If a policy, or the cluster, needs a library that is not installed.
-        OSError: If the folder or the store cannot be written to, workers do not start, or there is no cluster.
+        OSError: If workers do not start, or there is no cluster.
     """
     study = Study(
         policies=policies,

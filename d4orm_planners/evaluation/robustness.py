@@ -9,11 +9,12 @@ from math import isfinite
 from pathlib import Path
 
 from d4orm_env.core.arrays import short_repr
+from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.base.display import markdown_text
 from d4orm_planners.evaluation.comparison import PairedPolicies, compare_pairs
 from d4orm_planners.evaluation.disturbance_figures import draw_lines, draw_map, draw_noise, quantity_of, write_figure
 from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates
-from d4orm_planners.evaluation.tables import errors, interval, markdown, panels, table, target, write_csv, write_rates
+from d4orm_planners.evaluation.tables import errors, interval, markdown, panels, table, write_csv, write_rates
 
 THRESHOLD = 0.9
 """Share of the undisturbed success rate below which a policy is said to tolerate a disturbance no longer."""
@@ -44,13 +45,13 @@ def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate
         The paths.
 
     Raises:
-        ValueError: If there is nothing to write, or what is given is something else.
-        OSError: If the folder does not exist or cannot be written to.
+        ValueError: If there is nothing to write, what is given is something else, or the folder does not exist or
+            cannot be written to.
     """
     _check_given(rates, SuccessRate, "evaluate()")
     paths = [Path(folder, f"robustness.{kind}") for kind in ("csv", "md")]
     write_rates(paths[0], rates)
-    with target(paths[1]) as path:
+    with replaced_when_done(paths[1]) as path:
         path.write_text(markdown(rates), encoding="utf-8")
     if any(rate.disturbance for rate in rates):
         return paths
@@ -70,8 +71,8 @@ def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGro
         The paths; ``pairs.csv`` is not among them, and not written, where there is one policy only.
 
     Raises:
-        ValueError: If there is nothing to write, or what is given is something else.
-        OSError: If the folder does not exist or cannot be written to.
+        ValueError: If there is nothing to write, what is given is something else, or the folder does not exist or
+            cannot be written to.
     """
     _check_given(groups, TrialGroup, "run_study() of a study with disturbances")
     rates = success_rates(groups)
@@ -88,7 +89,7 @@ def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGro
     blocks = errors((rate.label, rate.error) for rate in rates)  # first, as below they look like bad policies
     blocks += [tolerance_tables(rates), "## Figures", _FIGURES, "\n".join(captions), *_pair_tables(rates, pairs)]
     paths = [Path(folder, name) for name in ("disturbances.md", "tolerance.csv")]
-    with target(paths[0]) as path:
+    with replaced_when_done(paths[0]) as path:
         path.write_text("\n\n".join(blocks) + "\n", encoding="utf-8")
     write_csv(paths[1], [vars(one) for one in tolerances(rates)])
     if pairs:

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
+from d4orm_env.core.errors import FileAccessError
+
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
 VERSION = 10
@@ -43,7 +45,7 @@ class SqliteFile:
                 if self._read_only
                 else ("used", "free some space or choose another folder")
             )
-            raise OSError(f"trial store {self.path} cannot be {action}: {error}; {remedy}") from error
+            raise FileAccessError(f"trial store {self.path} cannot be {action}: {error}; {remedy}") from error
         except sqlite3.DatabaseError as error:
             if error.sqlite_errorcode == sqlite3.SQLITE_NOTADB:
                 raise self._foreign(str(error)) from error

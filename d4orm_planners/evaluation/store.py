@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from d4orm_env.core.arrays import LARGEST_WHOLE, short_repr
+from d4orm_env.core.errors import MissingFileError
 from d4orm_planners.evaluation.sqlite_file import SqliteFile
 
 STORE = "trials.sqlite"
@@ -176,8 +177,7 @@ class TrialStore(SqliteFile):
         alone: No other process opens it, so that no locks are taken, which some network file systems do not have.
 
     Raises:
-        ValueError: If the file is something else, or of another version.
-        OSError: If it cannot be opened or written to.
+        ValueError: If the file is something else, of another version, or cannot be opened or written to.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, read_only: bool = False, alone: bool = False) -> None:
@@ -188,12 +188,12 @@ class TrialStore(SqliteFile):
         """The store in a file, or in a folder under its usual name, which must be there; to read only.
 
         Raises:
-            FileNotFoundError: If there is none.
+            MissingFileError: If there is none.
             ValueError: If the file is something else, or of another version.
         """
         file = Path(path) / STORE if Path(path).is_dir() else Path(path)
         if not file.is_file():
-            raise FileNotFoundError(f"there is no store of trials at {file}; `d4orm evaluate` makes one")
+            raise MissingFileError(f"there is no store of trials at {path}; `d4orm evaluate` makes one")
         return cls(file, read_only=True)
 
     def add(self, *trials: Trial) -> int:
@@ -203,8 +203,7 @@ class TrialStore(SqliteFile):
             How many were new, or took the place of one that had failed; a finished trial is never overwritten.
 
         Raises:
-            ValueError: If a number is too large for the store.
-            OSError: If it cannot be written to.
+            ValueError: If a number is too large for the store, or it cannot be written to.
         """
         with self._connection() as connection:
             connection.execute("BEGIN IMMEDIATE")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,7 +40,7 @@ def write_results(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) 
     """
     trials = TrialStore.existing(Path(folder) / STORE).trials()
     paths = [Path(folder, name) for name in ("table.md", "table.csv", "trials.csv", "trials.parquet")]
-    with target(paths[0]) as path:
+    with replaced_when_done(paths[0]) as path:
         path.write_text(markdown(rates), encoding="utf-8")
     write_rates(paths[1], rates)
     write_csv(paths[2], [vars(trial) for trial in trials])
@@ -55,7 +54,7 @@ def write_rates(path: Path, rates: Sequence[SuccessRate]) -> None:
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
     """Write at least one row, all with the same columns, as CSV; what is ``None`` is empty, and no text a formula."""
-    with target(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    with replaced_when_done(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows({name: spreadsheet_cell(value) for name, value in row.items()} for row in rows)
@@ -76,7 +75,7 @@ def write_parquet(path: Path, trials: Sequence[Trial]) -> bool:
         )
         for field in fields(Trial)
     }
-    with target(path) as temporary:
+    with replaced_when_done(path) as temporary:
         parquet.write_table(pyarrow.table(columns), temporary)
     return True
 
@@ -118,17 +117,6 @@ def _trials(file: ParquetFile) -> Iterator[Trial]:
             except ValueError as error:
                 raise ValueError(f"trial {number} {error}") from None
             number += 1
-
-
-@contextmanager
-def target(path: Path) -> Iterator[Path]:
-    """A temporary file that takes the place of ``path``; one that cannot be written is an ``OSError`` naming that."""
-    try:
-        with replaced_when_done(path) as temporary:
-            yield temporary
-    except OSError as error:
-        reason = error.strerror or error
-        raise OSError(f"{path} cannot be written: {reason}; free some space or choose another folder") from error
 
 
 def markdown(rates: Sequence[SuccessRate]) -> str:

@@ -12,7 +12,6 @@ import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from numbers import Real
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
@@ -21,8 +20,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.interpolate import BPoly, PPoly
 
-from d4orm_env.core.arrays import LARGEST, Floats, positive_number, short_repr
+from d4orm_env.core.arrays import LARGEST, Floats, positive_number, real_number
 from d4orm_env.core.errors import unknown
+from d4orm_env.core.files import make_folder, writing
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.verify import VerificationReport
 from d4orm_planners.tracking.ros_messages import write_bag
@@ -89,13 +89,14 @@ def sample_motion(motion: SmoothMotion, rate: float) -> Setpoints:
     """
     rate = positive_number(rate, "rate", most=MAX_RATE)
     if rate * motion.duration < 1:
-        raise ValueError(f"rate is {rate:g} Hz for a motion of {motion.duration:.3g} s; give at least a setpoint more")
+        least = f"{1.01 / motion.duration:.3g}"  # more than the least, however it is rounded
+        raise ValueError(f"rate is {rate:g} Hz for a motion of {motion.duration:.3g} s; give at least {least}")
     count = int(np.ceil(motion.duration * rate)) + 1
     robots = motion.problem.num_robots
     if count * robots > MAX_SAMPLES:
         raise ValueError(
             f"rate is {rate:g} Hz for {motion.duration:.0f} s and {robots} robots; use at most "
-            f"{MAX_SAMPLES / robots / motion.duration:.3g}"
+            f"{0.99 * MAX_SAMPLES / robots / motion.duration:.3g}"
         )
     time = np.arange(count) / rate
     position, velocity, acceleration, jerk = (motion.position(time, order) for order in range(4))
@@ -225,21 +226,21 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
     """Write a motion into a folder, which is made; files that are there stay, but for those of the same names.
 
     Raises:
-        ValueError: If there is no such format, the motion does not fit it, or the folder has files of more robots.
+        ValueError: If there is no such format, the motion does not fit it, the folder has files of more robots, or it
+            cannot be written; nothing is left behind then.
         ModuleNotFoundError: If a library for it is missing; the message names it.
-        OSError: If it cannot be written; nothing is left behind then.
     """
     if not isinstance(form, str) or form not in FORMATS:
         raise unknown("format", form, FORMATS)
-    if not isinstance(height, Real) or not abs(height) <= LARGEST:
-        raise ValueError(f"height is {short_repr(height)}; it must be a number of at most {LARGEST:g} m in magnitude")
+    if not abs(height := real_number(height, "height")) <= LARGEST:
+        raise ValueError(f"height is {height:g}; it must be at most {LARGEST:g} m in magnitude")
     if height and motion.problem.dimension == 3:
         raise ValueError(f"height is {height:g} m, and this team has heights of its own; leave it out")
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file; give a folder")
     setpoints = sample_motion(motion, rate)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=folder.parent, prefix=".export") as name:
+    make_folder(folder.parent)
+    with writing(folder), TemporaryDirectory(dir=folder.parent, prefix=".export") as name:
         pieces = FORMATS[form](motion, setpoints, Path(name), height)
         names = sorted(path.name for path in Path(name).iterdir())
         _refuse_others(folder, names)

@@ -109,7 +109,6 @@ def test_they_act_alike(form: Callable[..., Any], kind: str) -> None:
     [
         (torch.tensor([0.5, -2.0], dtype=torch.bfloat16, requires_grad=True), [0.5, -2.0]),
         (torch.tensor([1, 2]), [1.0, 2.0]),
-        (torch.tensor([True, False]), [1.0, 0.0]),
         ([np.float32([1, 2]), torch.tensor([3.0, 4.0], requires_grad=True)], [[1, 2], [3, 4]]),
         (torch.tensor([1e300], dtype=torch.float64), [np.inf]),
     ],

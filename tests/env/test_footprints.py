@@ -210,12 +210,12 @@ def test_files_keep_footprints(tmp_path: object) -> None:
     [
         (lambda: Box(0, 1), "length of Box is 0; it must be positive"),
         (lambda: Disc(float("nan")), "radius of Disc is nan"),
-        (lambda: Capsule(1, 1, offset="x"), "offset of Capsule must be a number of metres, not 'x'"),
-        (lambda: Box("1", 0.2), "length of Box must be a number of metres, not '1'"),
-        (lambda: Box(1, b"2"), "width of Box must be a number of metres, not b'2'"),
-        (lambda: Disc("1"), "radius of Disc must be a number of metres, not '1'"),
-        (lambda: Capsule(1, "1e-1"), "radius of Capsule must be a number of metres, not '1e-1'"),
-        (lambda: Ellipsoid(1, 1, np.str_("1")), "z of Ellipsoid must be a number of metres, not "),
+        (lambda: Capsule(1, 1, offset="x"), "offset of Capsule must be a number, not 'x'"),
+        (lambda: Box("1", 0.2), "length of Box must be a number, not '1'"),
+        (lambda: Box(1, b"2"), "width of Box must be a number, not b'2'"),
+        (lambda: Disc("1"), "radius of Disc must be a number, not '1'"),
+        (lambda: Capsule(1, "1e-1"), "radius of Capsule must be a number, not '1e-1'"),
+        (lambda: Ellipsoid(1, 1, np.str_("1")), "z of Ellipsoid must be a number, not "),
         (
             lambda: Polygon([[0, 0], [1, "0"], [0, 1]]),
             "corners of Polygon must be rows of two numbers, not [[0, 0], [1, '0']",
@@ -341,7 +341,7 @@ def test_discs_among_other_footprints_survive_a_file(tmp_path: Path) -> None:
     problem = Problem(team, [[0, 0, 0], [2, 0, 0], [4, 0, 0]], [[0, 3], [2, 3], [4, 3]])
     save_problem(problem, tmp_path / "team.yaml")
     assert load_problem(tmp_path / "team.yaml") == problem
-    with pytest.raises(ValueError, match="offset of Box must be a number of metres, not True"):
+    with pytest.raises(ValueError, match="offset of Box must be a number, not True"):
         Box(0.5, 0.2, True)
 
 

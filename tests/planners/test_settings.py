@@ -1,4 +1,4 @@
-"""Settings of every planner and policy: numbers in any spelling are the same settings; the rest is refused by name."""
+"""Settings of every planner and policy: numbers of any type are the same settings; the rest is refused by name."""
 
 from __future__ import annotations
 
@@ -62,18 +62,16 @@ def test_the_numbers_of_all_kinds_are_looked_at() -> None:
 
 
 @NUMBERS
-def test_every_spelling_of_a_number_is_the_same_setting(
-    kind: type[CheckedSettings], setting: str, number: type
-) -> None:
+def test_a_number_of_every_type_is_the_same_setting(kind: type[CheckedSettings], setting: str, number: type) -> None:
     default = getattr(kind(), setting)
     given = {"node": 0, "clip_after": 1, "check_every": 1}.get(setting, 0.01) if default is None else default
     value = number(given)
     expected = made(kind, setting, value)
-    spellings = [str(value), f" {value} ", np.array([value])[0]]
+    types = [np.array([value])[0]]
     if number is float:
-        spellings += [f"{value:e}", Decimal(str(value)), *([int(value)] if value == int(value) else [])]
-    for spelling in spellings:
-        config = made(kind, setting, spelling)
+        types += [Decimal(str(value)), *([int(value)] if value == int(value) else [])]
+    for same in types:
+        config = made(kind, setting, same)
         assert type(getattr(config, setting)) is number
         assert config == expected
         assert repr(config) == repr(expected)
@@ -81,7 +79,7 @@ def test_every_spelling_of_a_number_is_the_same_setting(
 
 
 NO_NUMBERS = (
-    "", "many", "1e", "nan", "-inf", "1" * 5000, True, np.True_, np.False_, -1, -1.5, float("nan"), float("inf"),
+    "", "1", "many", "nan", "1" * 5000, np.array("1"), True, np.True_, np.False_, -1, -1.5, float("nan"), float("inf"),
     10**400, -(10**400), 10**5000, 1e300, [1], [10**5000], {}, (), 1j, b"one", object(), np.arange(2), np.zeros((2, 2)),
 )  # fmt: skip
 
@@ -143,8 +141,8 @@ def test_a_name_that_is_no_text_is_unknown(name: Any) -> None:
         make_planner("d4orm", preset=name or [])
 
 
-def test_the_time_limit_is_the_same_in_every_spelling() -> None:
-    assert policy_settings("d4orm", time_limit="1e0") == policy_settings("d4orm", time_limit=1)
+def test_the_time_limit_is_a_number_as_well() -> None:
+    assert policy_settings("d4orm", time_limit=np.float32(1)) == policy_settings("d4orm", time_limit=1)
     with pytest.raises(ValueError, match="time_limit is inf"):
         make_policy("d4orm", time_limit=10**400)
 
@@ -159,7 +157,7 @@ def test_the_time_limit_is_the_same_in_every_spelling() -> None:
         ("d4orm", {"num_samples": 10**7 + 1}, "num_samples is 10000001; it must be at most 1e\\+07"),
         ("d4orm", {"num_steps": 10**6 + 1}, "num_steps is 1000001; it must be at most 1e\\+06"),
         ("ppo", {"path": [1]}, r"path must be text, not \[1\]"),
-        ("d4orm-c2f", {"beta_start": "0.5"}, "beta_start 0.5 is above beta_end 0.02"),
+        ("d4orm-c2f", {"beta_start": 0.5}, "beta_start 0.5 is above beta_end 0.02"),
     ],
 )
 def test_what_would_end_in_a_crash_is_refused(name: str, settings: dict[str, Any], message: str) -> None:
@@ -174,7 +172,7 @@ def test_a_path_is_kept_as_text() -> None:
 
 def test_settings_can_be_replaced_and_are_checked_again() -> None:
     config = make_planner("mppi").config
-    assert replace(config, sigma="2").sigma == 2.0
+    assert replace(config, sigma=2).sigma == 2.0
     with pytest.raises(ValueError, match="sigma is 0; it must be positive"):
         replace(config, sigma=0)
 

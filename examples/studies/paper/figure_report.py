@@ -10,11 +10,12 @@ from examples.studies.paper.figure import Figure, Group
 from examples.studies.paper.numbers import METRICS, Measured, column, first_solution, is_time, measured
 from examples.studies.paper.plots import draw
 
+from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.evaluation.comparison import Paired, paired
 from d4orm_planners.evaluation.leaderboard import origin
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import SuccessWithin, success_by
-from d4orm_planners.evaluation.tables import deadline_table, errors, table, target, write_csv
+from d4orm_planners.evaluation.tables import deadline_table, errors, table, write_csv
 
 INTRODUCTION = """\
 Success with its 95% interval (Wilson); runtime and denoising steps to the first solution: median and quartiles over
@@ -202,8 +203,8 @@ def write_figure(folder: Path, figure: Figure, groups: Sequence[Group]) -> list[
     said = [{f"paper_{metric}": _said(figure, row, metric) for metric in figure.metrics} for row in rows]
     columns = [{name: value for name, value in vars(row).items() if _is_told(figure, name)} for row in rows]
     write_csv(paths[0], [{**shown, **papers} for shown, papers in zip(columns, said)])
-    with target(paths[1]) as temporary:
+    with replaced_when_done(paths[1]) as temporary:
         temporary.write_text(markdown(figure, groups), encoding="utf-8")
-    with target(paths[2]) as temporary:
+    with replaced_when_done(paths[2]) as temporary:
         draw(temporary, figure, groups, rows)
     return paths
