@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Self, TypeVar
 
@@ -186,6 +186,11 @@ def short_repr(value: object) -> str:
     except ValueError:  # a number of thousands of digits somewhere within
         text = f"a {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def is_one_of(value: object, names: Iterable[str]) -> bool:
+    """Check that ``value`` is text and one of the names; an array, compared to them, has many answers."""
+    return isinstance(value, str) and value in list(names)
 
 
 def number_list(given: object, name: str, count: int | None = None) -> Floats:

@@ -21,13 +21,14 @@ from typing import IO, Any
 import numpy as np
 import yaml
 
+from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.errors import FileAccessError, MissingFileError
 
 
 def checked_path(path: object, what: str) -> Path:
     """Return the path of ``what``. Raises ValueError if it is neither text nor a path, or empty."""
     if not isinstance(path, (str, os.PathLike)) or path == "":
-        raise ValueError(f"the path of {what} must be text or a path, not {path!r}")
+        raise ValueError(f"the path of {what} must be text or a path, not {short_repr(path)}")
     return Path(path)
 
 

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, Floats, positive_number, short_repr, whole_number
+from d4orm_env.core.arrays import (
+    LARGEST,
+    SMALLEST,
+    FloatArray,
+    Floats,
+    is_one_of,
+    positive_number,
+    short_repr,
+    whole_number,
+)
 from d4orm_env.core.bodies import body_poses
 from d4orm_env.core.gaps import gaps_at, near_pairs, world_gap
 from d4orm_env.core.goal_poses import states_at_goals
@@ -43,7 +52,7 @@ SWINGS = 32
 
 def check_arrival(value: object) -> None:
     """Refuse what is no :data:`Arrival`."""
-    if value not in get_args(Arrival):
+    if not is_one_of(value, get_args(Arrival)):
         raise ValueError(f"arrival is {short_repr(value)}; choose one of {', '.join(get_args(Arrival))}")
 
 

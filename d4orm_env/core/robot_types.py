@@ -8,6 +8,7 @@ from types import MappingProxyType
 
 from d4orm_env.core.arrays import truth, whole_number
 from d4orm_env.core.errors import unknown
+from d4orm_env.core.files import MAX_ITEMS
 from d4orm_env.core.team import Team
 from d4orm_env.footprints import Ellipsoid
 
@@ -124,5 +125,5 @@ def make_team(name: str, num_robots: int, *, downwash: bool = False) -> Team:
         ValueError: If there is no such robot, it has no downwash, or the number is not positive.
     """
     settings = find_robot(name).settings(downwash)
-    models = (settings.pop("model"),) * whole_number(num_robots, "num_robots", 1)
+    models = (settings.pop("model"),) * whole_number(num_robots, "num_robots", 1, MAX_ITEMS)
     return Team(models, **settings)  # type: ignore[arg-type]

@@ -9,7 +9,7 @@ import numpy as np
 from crazyflow.drones import Drone
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, positive_number, short_repr
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, is_one_of, positive_number, short_repr
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -45,7 +45,7 @@ class DronePhysics:
     gust: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.drone not in DRONES:
+        if not is_one_of(self.drone, DRONES):
             raise ValueError(f"drone is {short_repr(self.drone)}; choose one of {', '.join(DRONES)}")
         for name in ("mass_factor", "thrust_factor"):
             object.__setattr__(self, name, positive_number(getattr(self, name), name, least=0.1, most=10))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
+from d4orm_env.core.arrays import is_one_of
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
@@ -62,7 +63,7 @@ def rollout(problem: Problem, controls: ArrayLike, engine: str = "auto") -> Traj
 
 def resolve_engine(name: str) -> str:
     """Return ``"cpu"`` or ``"jax"``, whichever a name means here."""
-    if name not in ENGINES:
+    if not is_one_of(name, ENGINES):
         raise unknown("engine", name, ENGINES)
     if name == "auto":
         name = "jax" if _accelerator_visible() else "cpu"

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, is_one_of, short_repr
 from d4orm_env.core.gaps import touching
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.observation_layout import ObservationLayout
@@ -148,8 +148,9 @@ class Viewer:
     """Draws a simulation in the environment's render mode: ``"rgb_array"``, ``"human"`` or ``None``."""
 
     def __init__(self, render_mode: str | None) -> None:
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise ValueError(f"render_mode is {render_mode!r}; choose one of {', '.join(RENDER_MODES)}, or None")
+        if render_mode is not None and not is_one_of(render_mode, RENDER_MODES):
+            known = ", ".join(RENDER_MODES)
+            raise ValueError(f"render_mode is {short_repr(render_mode)}; choose one of {known}, or None")
         self._mode = render_mode
         self._renderer: frames.FrameRenderer | frames.WindowRenderer | None = None
         self._problem: Problem | None = None

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import short_repr, truth
+from d4orm_env.core.arrays import is_one_of, short_repr, truth
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
@@ -147,7 +147,7 @@ class EnvOptions:
             raise ValueError(
                 f"randomize_instance is {short_repr(self.randomize_instance)}; it must be True, False or None"
             )
-        if self.progress not in ("straight", "path"):
+        if not is_one_of(self.progress, ("straight", "path")):
             raise ValueError(f"progress is {short_repr(self.progress)}; it must be 'straight' or 'path'")
         for name in ("observed_path", "line_of_sight", "egocentric"):
             truth(getattr(self, name), name)
@@ -155,7 +155,7 @@ class EnvOptions:
             raise ValueError(
                 f"lifelong is {short_repr(self.lifelong)}; it must be True or False, or a function that gives goals"
             )
-        sensed = "ray_range" if self.ray_range != type(self).ray_range else ""
+        sensed = "ray_range" if np.any(self.ray_range != type(self).ray_range) else ""
         sensed = "RayNoise" if any(isinstance(one, RayNoise) for one in self.disturbances) else sensed
         if sensed and not self.observed_rays:
             raise ValueError(f"{sensed} is of range sensors, and these robots have none; give observed_rays")

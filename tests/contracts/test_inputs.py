@@ -14,7 +14,18 @@ import numpy as np
 import pytest
 import torch
 
-from d4orm_env import Problem, Team, World, disturbances, make_problem, navigation_v0, rollout, save_problem, verify
+from d4orm_env import (
+    Problem,
+    Team,
+    World,
+    disturbances,
+    make_problem,
+    make_team,
+    navigation_v0,
+    rollout,
+    save_problem,
+    verify,
+)
 from d4orm_env.disturbances import Disturbance
 from d4orm_env.footprints import Box, Capsule, Disc, Ellipsoid, Polygon
 from d4orm_env.render import save_animation, save_picture
@@ -106,6 +117,32 @@ def test_text_and_truth_are_no_numbers(name: str, value: Any, tmp_path: Path, mo
         ENTRIES[name](value)
     assert "\n" not in str(said.value)
     assert not list(tmp_path.iterdir())
+
+
+NAMES: dict[str, Callable[[Any], object]] = {
+    "arrival": lambda value: make_problem("circle", arrival=value),
+    "engine": lambda value: rollout(PROBLEM, np.zeros(CONTROLS), engine=value),
+    "render_mode": lambda value: navigation_v0.parallel_env(render_mode=value),
+    "progress": lambda value: navigation_v0.parallel_env(progress=value),
+    "mode": lambda value: Controller("orca", mode=value),
+    "path": lambda value: plan().save(value),
+}
+
+
+@pytest.mark.parametrize("value", [np.zeros((2, 2)), np.array(["cpu", "dock"]), [1], {}, 3, list(range(99))], ids=repr)
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_no_name_is_refused_in_a_line(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"{name}.* (is|not) ") as said:
+        NAMES[name](value)
+    assert "\n" not in str(said.value)
+    assert "ambiguous" not in str(said.value)
+    assert len(str(said.value)) < 250
+
+
+def test_a_team_too_large_is_refused_before_it_is_made() -> None:
+    for number in (10**400, 10**9):
+        with pytest.raises(ValueError, match=r"num_robots is .* at most 10000"):
+            make_team("crazyflie", number)
 
 
 def test_a_reward_may_be_a_truth_value() -> None:
