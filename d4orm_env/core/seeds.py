@@ -64,7 +64,7 @@ def _sequence(seed: int, stream: Stream, key: tuple[int, ...]) -> np.random.Seed
 
 def checked_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
     """Seeds of several episodes, each once, at least one, and none larger than files have room for."""
-    if not isinstance(seeds, Iterable) or getattr(seeds, "ndim", 1) == 0:
+    if isinstance(seeds, bytes) or not isinstance(seeds, Iterable) or getattr(seeds, "ndim", 1) == 0:
         raise ValueError(f"seeds is {short_repr(seeds)}; give the seeds themselves, as range(50)")
     checked = tuple(dict.fromkeys(whole_number(seed, "seed", 0, LARGEST_WHOLE) for seed in seeds))
     if not checked:

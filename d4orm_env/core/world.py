@@ -77,7 +77,7 @@ class World(Frozen):
         upper: ArrayLike | None = None,
         origin: ArrayLike | None = None,
     ) -> None:
-        if isinstance(dimension, float) or dimension not in (2, 3):
+        if not isinstance(dimension, int | np.integer) or dimension not in (2, 3):
             raise ValueError(f"dimension of the world is {short_repr(dimension)}; it must be 2 or 3")
         if (lower is None) != (upper is None):
             raise ValueError("bounds need both lower and upper; give both, or neither for an open world")

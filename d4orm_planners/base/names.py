@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TypeGuard
 
-from d4orm_env.core.arrays import short_repr
+from d4orm_env.core.arrays import is_one_of, short_repr
 from d4orm_env.core.registry import Registry
 from d4orm_planners.base.planner import Planner
 
@@ -63,7 +63,7 @@ def register_policy(name: str, factory: object) -> None:
 
 
 def _refuse_name_of(other: Registry[object], name: object) -> None:
-    if name in other.own():
+    if is_one_of(name, other.own()):
         raise ValueError(f"{other.what} {name!r} has that name already; register yours under another")
 
 

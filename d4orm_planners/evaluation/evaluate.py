@@ -14,7 +14,7 @@ from d4orm_env.core.arrays import duration, whole_number
 from d4orm_env.core.files import checked_path, make_folder
 from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
-from d4orm_planners.d_d4orm.ray_planner import import_ray
+from d4orm_planners.d_d4orm.ray_planner import host_and_port, import_ray
 from d4orm_planners.evaluation.pool import RAY_USE, ProcessWorker, run_here, run_jobs, run_on_ray
 from d4orm_planners.evaluation.robustness import write_disturbances
 from d4orm_planners.evaluation.store import STORE, Trial, TrialKey, TrialStore
@@ -137,6 +137,7 @@ def run_study(
     groups = _checked_groups(study, trial_timeout, workers)
     if ray is not None:
         import_ray(RAY_USE)  # before there is a store
+        host_and_port(ray)
     folder = checked_path(out, "the folder of results")
     make_folder(folder)
     store = TrialStore(folder / STORE)

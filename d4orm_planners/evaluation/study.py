@@ -209,7 +209,11 @@ def _load(path: Path) -> Problem:
 
 def _several(values: T | Iterable[T], name: str = "") -> tuple[T, ...]:
     """One value, or several; with a ``name``, they are refused by it unless they can be told apart."""
-    one = isinstance(values, str | os.PathLike) or not isinstance(values, Iterable) or getattr(values, "ndim", 1) == 0
+    one = (
+        isinstance(values, str | bytes | os.PathLike)
+        or not isinstance(values, Iterable)
+        or getattr(values, "ndim", 1) == 0
+    )
     several = (values,) if one else tuple(values)  # type: ignore[arg-type] # iterable
     for value in several if name else ():
         if not isinstance(value, Hashable):

@@ -29,7 +29,7 @@ from d4orm_env import (
 from d4orm_env.disturbances import Disturbance
 from d4orm_env.footprints import Box, Capsule, Disc, Ellipsoid, Polygon
 from d4orm_env.render import save_animation, save_picture
-from d4orm_planners import Controller, Plan, make_planner, make_policy
+from d4orm_planners import Controller, Plan, evaluate, make_planner, make_policy, register_planner, register_policy
 from d4orm_planners.evaluation import TrialStore
 
 PROBLEM = Problem(Team(("holonomic2d",) * 2), [[-1, 0, 0, 0], [1, 1, 0, 0]], [[1, 0], [-1, 1]], World(), horizon=60)
@@ -126,17 +126,27 @@ NAMES: dict[str, Callable[[Any], object]] = {
     "progress": lambda value: navigation_v0.parallel_env(progress=value),
     "mode": lambda value: Controller("orca", mode=value),
     "path": lambda value: plan().save(value),
+    "planner name": lambda value: register_planner(value, "package:Name"),
+    "policy name": lambda value: register_policy(value, "package:Name"),
+    "dimension": World,
 }
 
 
-@pytest.mark.parametrize("value", [np.zeros((2, 2)), np.array(["cpu", "dock"]), [1], {}, 3, list(range(99))], ids=repr)
+@pytest.mark.parametrize("value", [np.zeros((2, 2)), np.array(["cpu", "dock"]), [1], {}, 9, list(range(99))], ids=repr)
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_no_name_is_refused_in_a_line(name: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"{name}.* (is|not) ") as said:
+    with pytest.raises(ValueError, match=f"{name} .*(is|not) ") as said:
         NAMES[name](value)
     assert "\n" not in str(said.value)
     assert "ambiguous" not in str(said.value)
     assert len(str(said.value)) < 250
+
+
+@pytest.mark.parametrize("name", ["seeds", "control_noise_std"])
+def test_bytes_are_no_list_of_numbers(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=f"{name} .*b'x'"):
+        evaluate(["go-to-goal"], "circle", **{"seeds": [0], name: b"x"}, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_team_too_large_is_refused_before_it_is_made() -> None:

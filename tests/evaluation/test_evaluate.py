@@ -24,7 +24,7 @@ from planner_support import program
 from d4orm_env import make_problem, save_problem
 from d4orm_env.disturbances import Delay
 from d4orm_planners import IterationRecord, Policy, evaluate
-from d4orm_planners.evaluation import tables, trials
+from d4orm_planners.evaluation import trials
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
 from d4orm_planners.evaluation.pool import ProcessWorker, run_jobs
@@ -424,10 +424,10 @@ def test_without_pyarrow_there_is_csv_and_a_word_about_it(
 def test_a_disk_that_fills_up_while_exporting_is_one_line(
     d4orm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path) -> Any:
+    def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(tables, "replaced_when_done", full)
+    monkeypatch.setattr("os.fsync", full)
     status, _, err = d4orm("evaluate", "-p", "go-to-goal", "-k", "2", "-n", "1", "-j", "1", "-q", "-o", "here")
     assert status == 2
     assert err.count("\n") == 1
@@ -755,6 +755,7 @@ def test_an_unreachable_cluster_is_one_line(d4orm, address: str, message: str, m
     status, _, err = d4orm("evaluate", "-p", "go-to-goal", "-k", "2", "-n", "1", "--ray", address)
     assert (status, err.count("\n")) == (2, 1)
     assert message in err
+    assert Path("evaluation").exists() == (address != "nowhere")
 
 
 OWN_MODEL = """
