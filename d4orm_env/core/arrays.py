@@ -193,6 +193,12 @@ def is_one_of(value: object, names: Iterable[str]) -> bool:
     return isinstance(value, str) and value in list(names)
 
 
+def check_choice(value: object, name: str, names: Collection[str]) -> None:
+    """Refuse what is none of the names."""
+    if not is_one_of(value, names):
+        raise ValueError(f"{name} is {short_repr(value)}; choose one of {', '.join(names)}")
+
+
 def number_list(given: object, name: str, count: int | None = None) -> Floats:
     """A list of finite numbers in a file, or one number; the first ``count`` of them, where so many are wanted."""
     try:

@@ -14,7 +14,7 @@ from d4orm_env.core.arrays import (
     SMALLEST,
     FloatArray,
     Floats,
-    is_one_of,
+    check_choice,
     positive_number,
     short_repr,
     whole_number,
@@ -52,8 +52,7 @@ SWINGS = 32
 
 def check_arrival(value: object) -> None:
     """Refuse what is no :data:`Arrival`."""
-    if not is_one_of(value, get_args(Arrival)):
-        raise ValueError(f"arrival is {short_repr(value)}; choose one of {', '.join(get_args(Arrival))}")
+    check_choice(value, "arrival", get_args(Arrival))
 
 
 def check_is_team(value: object) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from crazyflow.drones import Drone
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, is_one_of, positive_number, short_repr
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, check_choice, positive_number, short_repr
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -45,8 +45,7 @@ class DronePhysics:
     gust: float = 0.0
 
     def __post_init__(self) -> None:
-        if not is_one_of(self.drone, DRONES):
-            raise ValueError(f"drone is {short_repr(self.drone)}; choose one of {', '.join(DRONES)}")
+        check_choice(self.drone, "drone", DRONES)
         for name in ("mass_factor", "thrust_factor"):
             object.__setattr__(self, name, positive_number(getattr(self, name), name, least=0.1, most=10))
         object.__setattr__(self, "gust", positive_number(self.gust, "gust", zero_allowed=True, most=10))

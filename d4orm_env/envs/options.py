@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import is_one_of, short_repr, truth
+from d4orm_env.core.arrays import check_choice, short_repr, truth
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
@@ -147,8 +147,7 @@ class EnvOptions:
             raise ValueError(
                 f"randomize_instance is {short_repr(self.randomize_instance)}; it must be True, False or None"
             )
-        if not is_one_of(self.progress, ("straight", "path")):
-            raise ValueError(f"progress is {short_repr(self.progress)}; it must be 'straight' or 'path'")
+        check_choice(self.progress, "progress", ("straight", "path"))
         for name in ("observed_path", "line_of_sight", "egocentric"):
             truth(getattr(self, name), name)
         if not (isinstance(self.lifelong, bool) or callable(self.lifelong)):

@@ -17,7 +17,7 @@ from pettingzoo import AECEnv
 from pettingzoo.utils import OrderEnforcingWrapper
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.arrays import FloatArray, is_one_of, short_repr
+from d4orm_env.core.arrays import FloatArray, check_choice, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_env.envs.base_env import Frame, TeamSimulation, Viewer
 from d4orm_env.envs.body_simulation import BodySimulation
@@ -189,8 +189,7 @@ class parallel_env(navigation_v0.parallel_env):
     ) -> None:
         if not isinstance(physics, Physics | None):
             raise ValueError(f"physics is {short_repr(physics)}; give d4orm_env.mujoco.Physics(...), or leave it out")
-        if not is_one_of(renderer, RENDERERS):
-            raise ValueError(f"renderer is {short_repr(renderer)}; choose one of {', '.join(RENDERERS)}")
+        check_choice(renderer, "renderer", RENDERERS)
         self._physics, self._renderer = physics or Physics(), renderer
         super().__init__(scenario, num_robots, **options)
 

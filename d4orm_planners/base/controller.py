@@ -9,16 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import (
-    BoolArray,
-    FloatArray,
-    Floats,
-    is_one_of,
-    positive_number,
-    read_only,
-    short_repr,
-    truth,
-)
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, check_choice, positive_number, read_only, truth
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.envs.joint_state import JointState, split_state
@@ -103,8 +94,7 @@ class Controller:
         tracker: bool = False,
         **settings: Any,
     ) -> None:
-        if not is_one_of(mode, get_args(Mode)):
-            raise ValueError(f"mode is {short_repr(mode)}; choose one of {', '.join(get_args(Mode))}")
+        check_choice(mode, "mode", get_args(Mode))
         self.mode, default = mode, 0.5 if tracker else 0.2 if mode == "nominal" else 0.0
         self.reserve = default if reserve is None else positive_number(reserve, "reserve", zero_allowed=True, most=0.9)
         self.timeout = None if timeout is None else positive_number(timeout, "timeout")

@@ -178,7 +178,7 @@ def test_environments_travel_with_their_ways() -> None:
 
 
 def test_bad_options_are_named() -> None:
-    with pytest.raises(ValueError, match="progress is 'round'; it must be 'straight' or 'path'"):
+    with pytest.raises(ValueError, match="progress is 'round'; choose one of straight, path"):
         navigation_v0.parallel_env("circle", progress="round")
     with pytest.raises(ValueError, match="observed_path is 1; it must be True or False"):
         navigation_v0.parallel_env("circle", observed_path=1)

@@ -268,7 +268,7 @@ def test_an_episode_that_fails_is_named_and_the_others_are_kept(workers: int, tm
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"agents": "all"}, "agents is 'all'; choose 'team' or 'robot'"),
+        ({"agents": "all"}, "agents is 'all'; choose one of team, robot"),
         ({"seeds": ()}, "seeds is empty"),
         ({"seeds": 5}, "seeds is 5; give the seeds themselves"),
         ({"seeds": (-1,)}, "seed is -1; it must be at least 0"),

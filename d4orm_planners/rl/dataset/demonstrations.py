@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from d4orm_env import __version__, navigation_v0
-from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, is_one_of, plain_number, short_repr, truth
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, check_choice, plain_number, short_repr, truth
 from d4orm_env.core.files import ArrayArchive, replaced_when_done
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import source_digest
@@ -74,8 +74,7 @@ class Demonstrations:
     _source: Any = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if not is_one_of(self.agents, AGENTS):
-            raise ValueError(f"agents is {short_repr(self.agents)}; choose 'team' or 'robot'")
+        check_choice(self.agents, "agents", AGENTS)
         for name in ("settings", "environment"):
             if not isinstance(given := getattr(self, name), Mapping):
                 raise ValueError(f"{name} is {short_repr(given)}; give arguments by name, in a mapping")
