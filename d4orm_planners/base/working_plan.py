@@ -148,7 +148,7 @@ class WorkingPlan:
         for begin, end in zip(low, high, strict=True):
             near = begin[:, None] - end <= far
             may_bear &= near & near.swapaxes(0, 1)
-        bears_on: BoolArray = np.logical_or.reduce(may_bear, axis=2)
+        bears_on: BoolArray = may_bear.any(axis=2)
         return bears_on
 
     def _costs(self, robots: ArrayLike, paths: FloatArray, arrived: BoolArray) -> tuple[Floats, IntArray]:
