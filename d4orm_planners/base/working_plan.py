@@ -105,51 +105,29 @@ class WorkingPlan:
         It has the fewest faults and, of those with as many, takes the least time. With ``or_longer`` it may take longer
         than what the robot does, as long as it has no more faults.
         """
-        index, horizon = np.asarray(robots), self.problem.horizon
-        # Their present paths come first.
-        options = np.concatenate([self.positions[:, index, None], paths.positions], axis=2)
-        options = np.ascontiguousarray(options.transpose(1, 2, 0, 3))
-        arrives = np.column_stack([self.arrived[index], paths.arrived])
-        bears_on, left = self._bears_on(options), np.arange(len(index))
-        # Most paths turn to the goal where the robot heads for it anyhow. Of equal ones no costs need be known.
-        has_choice = bears_on.diagonal() | (arrives != arrives[:, :1]).any(axis=1)
-        # At once those to whom it makes no difference, nor they to any before them that has still to choose.
-        while len(left):
-            waits = np.tril(bears_on[np.ix_(left, left)], -1).any(axis=1)
-            some, left = left[~waits], left[waits]
-            costs, choosing = np.zeros((len(some), options.shape[1])), has_choice[some]
-            if choosing.any():
-                those = some[choosing]
-                costs[choosing] = self._costs(index[those], options[those], arrives[those])[0]
-            for row in np.flatnonzero(self.reported[index[some]] <= horizon):
-                present = self.states[:, index[some[row]], None, : paths.states.shape[3]]
-                costs[row, 0] += 1
-                costs[row, 1:] += (paths.states[:, some[row]] == present).all(axis=(0, 2))
-            best = costs[:, 1:].argmin(axis=1)
-            most = np.floor(costs[:, 0]) + 1 if or_longer else costs[:, 0]
-            taken = costs[np.arange(len(some)), 1 + best] < most
-            some, best = some[taken], best[taken]
-            controls, states = paths.controls[:, some, best], paths.states[:, some, best]
-            self.move(index[some], controls, states, paths.arrived[some, best])
+        for i, robot in enumerate(np.asarray(robots).tolist()):
+            costs = self._path_costs(robot, np.moveaxis(paths.positions[:, i], 1, 0), paths.arrived[i])
+            if self.reported[robot] <= self.problem.horizon:
+                costs[0] += 1
+                costs[1:] += (paths.states[:, i] == self.states[:, robot, None, : paths.states.shape[3]]).all(
+                    axis=(0, 2)
+                )
+            present, best = costs[0], int(costs[1:].argmin())
+            if costs[1 + best] < (np.floor(present) + 1 if or_longer else present):
+                self.move([robot], paths.controls[:, [i], best], paths.states[:, [i], best], paths.arrived[[i], best])
 
-    def _bears_on(self, options: FloatArray) -> BoolArray:
-        """``(R, R)`` whether the choice of one of two robots may bear on what the paths of the other cost.
-
-        It does not where they are too far apart on all paths ``(R, V, H+1, d)``, by blocks of steps, or where neither
-        has a choice.
-        """
-        blocks = np.arange(0, options.shape[2], self.index.table.block)
-        differs = np.logical_or.reduceat((options != options[:, :1]).any(axis=1).any(axis=2), blocks, axis=1)
-        may_bear, far = differs[:, None] | differs, 1.001 * self.index.table.safety_distance
-        low, high = (
-            np.moveaxis(bound.reduceat(bound.reduce(options, axis=1), blocks, axis=1), 2, 0).astype(np.float64, "C")
-            for bound in (np.minimum, np.maximum)
-        )
-        for begin, end in zip(low, high, strict=True):
-            near = begin[:, None] - end <= far
-            may_bear &= near & near.swapaxes(0, 1)
-        bears_on: BoolArray = may_bear.any(axis=2)
-        return bears_on
+    def _path_costs(self, robot: int, paths: FloatArray, arrived: BoolArray) -> Floats:
+        """``(1 + V,)`` costs of a robot's present path and of others ``(V, H+1, d)``; all zero if they are the same."""
+        positions = np.concatenate([self.positions[None, :, robot], paths])
+        arrives = np.append(self.arrived[robot], arrived)
+        # Most paths turn to the goal where the robot heads for it anyhow. Equal ones are checked once.
+        alike = (positions[:, None] == positions[:2]).all(axis=(2, 3)) & (arrives[:, None] == arrives[:2])
+        same = np.where(alike.any(axis=1), alike.argmax(axis=1), np.arange(len(positions)))
+        different, which = np.unique(same, return_inverse=True)
+        if len(different) == 1:
+            return np.zeros(len(positions))
+        costs: Floats = self._costs([robot], positions[None, different], arrives[None, different])[0][0, which]
+        return costs
 
     def _costs(self, robots: ArrayLike, paths: FloatArray, arrived: BoolArray) -> tuple[Floats, IntArray]:
         """``(R, V)`` faults of paths ``(R, V, H+1, d)``, plus the share of the horizon that they take, less than one;

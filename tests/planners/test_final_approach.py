@@ -156,8 +156,7 @@ def test_who_is_refused_is_at_fault_until_it_moves() -> None:
     faults, first = team.faults([0, 1])
     assert faults.tolist() == [1, 1]
     assert first.tolist() == [2, 2]  # they meet within the second step
-    first_alone = problem.select([0])
-    path = drives(first_alone, *at_rest(first_alone), [[0]], np.full((1, 1, 1, 2), [[0.0, 1.0]]))
+    path = drives(problem, *at_rest(problem), [[0], [0]], np.full((2, 1, 1, 2), [[0.0, 1.0]]))
     team.take_best([0], path)
     assert team.faults([0, 1])[0].tolist() == [0, 1]
     # What it does already is no other way.

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from engine_support import MODEL_NAMES
 
-from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
@@ -22,7 +21,7 @@ from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine import path_index
 from d4orm_planners.hybrid.rerouting import reroute
 from d4orm_planners.mapf import beam_search
-from d4orm_planners.tracking.steering import Rollouts, at_rest, drives, straight_drives
+from d4orm_planners.tracking.steering import straight_drives
 
 
 def rerouted(problem: Problem, seed: int = 0) -> WorkingPlan:
@@ -57,26 +56,15 @@ def test_a_mixed_team_is_rerouted_model_by_model() -> None:
     assert team.arrived.all()
 
 
-@pytest.mark.parametrize("or_longer", [False, True])
-def test_robots_choose_as_one_after_the_other(or_longer: bool) -> None:
-    """They choose between detours where many meet."""
-    problem = make_problem("random", num_robots=24, seed=1)
-    vias = np.random.default_rng(0).normal(problem.start[:, None, None, :2], 3.0, (24, 4, 1, 2))
-    paths = drives(problem, *at_rest(problem), np.zeros((24, 4), int), vias)
-    straight, order = straight_drives(problem).controls[:, :, 0], np.arange(24)[::-1]
-    search = SolveRun(make_planner("hybrid", engine="cpu"), problem, 0, straight)
-    at_once, in_turn = (WorkingPlan(search, search.current.trajectory) for _ in range(2))
-    at_once.take_best(order, taking(paths, order), or_longer=or_longer)
-    for robot in order[:, None]:
-        in_turn.take_best(robot, taking(paths, robot), or_longer=or_longer)
-    np.testing.assert_array_equal(at_once.controls, in_turn.controls)
-    np.testing.assert_array_equal(at_once.positions, in_turn.positions)
-    assert (at_once.controls != straight).any(axis=(0, 2)).sum() > 5
-
-
-def taking(paths: Rollouts, robots: IntArray) -> Rollouts:
-    """The paths of some robots."""
-    return Rollouts(paths.controls[:, robots], paths.states[:, robots], paths.arrived[robots], paths.dimension)
+def test_a_path_costs_what_it_costs_whichever_paths_it_is_compared_with() -> None:
+    """What a robot does at present, the same again, standing still, another robot's path, and that again."""
+    team = rerouted(make_problem("random", num_robots=10, seed=1))
+    own, other = (team.positions[:, robot] for robot in (3, 4))
+    paths, arrived = np.stack([own, np.repeat(own[:1], len(own), axis=0), other, other]), np.array([1, 0, 1, 1], bool)
+    alone = [team._costs([3], path[None, None], arrived[None, [i]])[0][0, 0] for i, path in enumerate(paths)]
+    assert team._path_costs(3, paths, arrived).tolist() == [alone[0], *alone]
+    assert len(set(alone)) == 3
+    assert team._path_costs(3, paths[:1], arrived[:1]).tolist() == [0.0, 0.0]
 
 
 def test_who_cannot_pass_waits() -> None:
