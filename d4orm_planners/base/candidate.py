@@ -40,13 +40,9 @@ class Candidate:
     controls: FloatArray  #: ``(H, K, m)`` as executed: inside the limits, zero after arrival
     trajectory: Trajectory  #: Their rollout
     failed: BoolArray  #: ``(K,)`` robots that do not arrive, or violate the margin at some step that was checked
-    #: Report of :func:`d4orm_env.verify`; ``None`` where a robot fails at any step, and it was not asked
+    #: Report of :func:`d4orm_env.verify`; ``None`` where a robot fails at any step, or it was not asked
     report: VerificationReport | None
-
-    @property
-    def solved(self) -> bool:
-        """True if all arrive, the margin is kept at every step, and :func:`d4orm_env.verify` agrees."""
-        return self.report is not None and self.report.ok
+    solved: bool  #: Whether all arrive, the margin is kept at every step, and the report, if there is one, agrees
 
     @property
     def unsolved(self) -> BoolArray:
@@ -72,7 +68,7 @@ def evaluate_controls(
 ) -> Candidate:
     """Roll out and evaluate controls ``(H, K, m)``: failures at every ``check_interval``-th step, a solution at all.
 
-    If it is not ``judged`` what happens between steps does not count.
+    It is ``judged`` by :func:`d4orm_env.verify` too, or what happens between steps does not count.
     """
     bound = MOST_OF_LIMIT * problem.team.control_limits
     bounded = np.clip(controls, -bound, bound)
@@ -80,9 +76,9 @@ def evaluate_controls(
     at_rest = trajectory.arrived[:-1, :, None] & problem.docks
     planned = np.where(at_rest, np.float32(0), bounded)
     failed = failed_robots(trajectory, check_interval)
-    judge = verify if judged else _unjudged
-    report = None if failed_robots(trajectory).any() else judge(problem, trajectory.controls)
-    return Candidate(planned, trajectory.controls, trajectory, failed, report)
+    solved = not failed_robots(trajectory).any()
+    report = verify(problem, trajectory.controls) if solved and judged else None
+    return Candidate(planned, trajectory.controls, trajectory, failed, report, solved and (report is None or report.ok))
 
 
 def failed_robots(trajectory: Trajectory, check_interval: int = 1) -> BoolArray:
@@ -93,11 +89,6 @@ def failed_robots(trajectory: Trajectory, check_interval: int = 1) -> BoolArray:
     violated = trajectory.margin_violated[check_interval::check_interval]
     failed: BoolArray = ~trajectory.arrived[-1] | violated.any(axis=0)
     return failed
-
-
-def _unjudged(problem: Problem, controls: FloatArray) -> VerificationReport:
-    unknown = np.full(problem.num_robots, np.nan)
-    return VerificationReport(np.nan, np.nan, unknown, unknown, True, [])
 
 
 def step_faults(problem: Problem, trajectory: Trajectory, unreachable: Set[int]) -> dict[int, list[str]]:

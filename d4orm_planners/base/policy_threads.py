@@ -18,8 +18,6 @@ Result = TypeVar("Result")
 
 ATTRIBUTE = "_driving"
 """Attribute of a policy's :class:`Driving`, which its copies do not share."""
-SWITCH = 5e-4
-"""Time for which a thread beside a control loop keeps the interpreter at most [s], a tenth of Python's own."""
 _REMEDY = "make a policy for every thread, with make_policy() or copy.copy()"
 
 
@@ -156,8 +154,6 @@ class Background(Generic[Result]):
 def _yield_to_others() -> None:
     """Keep the calling thread to one core, and lower its priority: on Linux its number stands for that here."""
     keep_to_one_core()
-    # For all threads, there is no other: a loop waits for the interpreter after each of its many kernels.
-    sys.setswitchinterval(min(SWITCH, sys.getswitchinterval()))
     if sys.platform != "linux":
         return
     thread = threading.get_native_id()

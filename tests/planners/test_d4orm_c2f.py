@@ -452,14 +452,6 @@ def test_no_control_loop_has_to_compile_its_last_resort() -> None:
     assert subprocess.run([sys.executable, "-c", script]).returncode == 0
 
 
-def test_work_that_yields_lets_go_of_the_interpreter_more_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[float] = []
-    monkeypatch.setattr(sys, "setswitchinterval", told.append)
-    for before, after in ((5e-3, 5e-4), (1e-4, 1e-4)):
-        monkeypatch.setattr(sys, "getswitchinterval", lambda before=before: before)
-        assert Background(yielding=True).start(lambda: told[-1]).result() == after
-
-
 def test_work_that_yields_leaves_other_cores_to_the_control_loop() -> None:
     for yielding, expected in ((False, [[0, 2], [2, 4]]), (True, [[0, 4]])):
         background, parts = Background[None](yielding=yielding), []
