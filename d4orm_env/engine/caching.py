@@ -30,6 +30,7 @@ from numba.core.typing.templates import Signature
 from numba.misc.appdirs import AppDirs
 
 from d4orm_env.dynamics.source_digest import bytecode, pieces
+from d4orm_env.engine.compilers import KernelCompiler
 from d4orm_env.engine.kernel_files import KernelFiles, ShippedFiles, Turn, shipped_folder
 
 P = ParamSpec("P")
@@ -160,7 +161,9 @@ def cached_kernel(variant: str = "", key: str = "", **options: Any) -> Callable[
     def decorate(function: Callable[P, R_co]) -> Kernel[P, R_co]:
         function.__qualname__ += variant and f"_{variant}"
         # No C code calls a kernel.
-        dispatcher = numba.njit(nogil=True, **options | {"no_cfunc_wrapper": True})(function)
+        dispatcher = numba.njit(nogil=True, **options | {"no_cfunc_wrapper": True, "pipeline_class": KernelCompiler})(
+            function
+        )
         if dispatcher is function:
             raise ImportError("NUMBA_DISABLE_JIT is set, but the kernels run only when compiled; unset it")
         with suppress(RuntimeError):

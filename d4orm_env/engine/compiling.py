@@ -7,8 +7,6 @@ from typing import Any, Protocol, TypeVar
 
 import numba
 import numpy as np
-from numba.core import compiler
-from numba.core.codegen import JITCodeLibrary
 from numba.cpython.unsafe import numbers
 from numba.extending import register_jitable
 from numba.np.unsafe import ndarray
@@ -16,6 +14,7 @@ from numba.np.unsafe import ndarray
 from d4orm_env.core import winding
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.dynamics import collision, formulas, robot_model, transition
+from d4orm_env.engine.compilers import PartCompiler
 
 ZERO = np.float32(0)
 ONE = np.float32(1)
@@ -26,53 +25,6 @@ class Compiler(Protocol):
     """A decorator that compiles a function, which otherwise stays what it is."""
 
     def __call__(self, function: F, /) -> F: ...
-
-
-class _PartLibrary(JITCodeLibrary):
-    """Code of a function that only kernels call, to be linked into theirs and optimised there.
-
-    By itself numba optimises every function by itself and makes machine code of it, then does all that again wherever
-    it is called, at every level of calls.
-    """
-
-    def _optimize_functions(self, ll_module: Any) -> None:
-        # The kernel's optimisation will do the rest.
-        ll_module.data_layout = self._codegen._data_layout
-        for function in ll_module.functions:
-            if not function.is_declaration:
-                manager, builder = self._codegen._function_pass_manager(opt=1)
-                manager.run(function, builder)
-
-    def _optimize_final_module(self) -> None:
-        pass
-
-    def _finalize_final_module(self) -> None:
-        self._finalize_dynamic_globals()
-        self._verify_declare_only_symbols()
-        self._finalized = True
-
-    def get_pointer_to_function(self, name: str) -> int:
-        """Return null: there is no machine code."""
-        return 0
-
-    @property
-    def codegen(self) -> Any:
-        """Return a stand-in: the compiler would tell machine code its environment."""
-        return _NoMachineCode
-
-
-class _NoMachineCode:
-    @staticmethod
-    def set_env(env_name: str, env: object) -> None:
-        pass
-
-
-class PartCompiler(compiler.Compiler):
-    """numba's compiler, with such libraries."""
-
-    def define_pipelines(self) -> Any:
-        self.state.library = _PartLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
-        return compiler.Compiler.define_pipelines(self)
 
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy"}

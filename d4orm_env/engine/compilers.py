@@ -1,0 +1,162 @@
+"""numba's compiler for kernels, and for what they call: without what only Python needs and what it does over and over.
+
+Two thirds of its time are spent in Python.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache, partial
+from types import CodeType
+from typing import Any
+
+from llvmlite.ir import Type
+from numba.core import compiler, event, ir, typed_passes, types, untyped_passes
+from numba.core.codegen import JITCodeLibrary
+from numba.core.registry import cpu_target
+
+
+class _PartLibrary(JITCodeLibrary):
+    """Code of a function that only kernels call, to be linked into theirs and optimised there.
+
+    By itself numba optimises every function by itself and makes machine code of it, then does all that again wherever
+    it is called, at every level of calls.
+    """
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        # The kernel's optimisation will do the rest.
+        ll_module.data_layout = self._codegen._data_layout
+        for function in ll_module.functions:
+            if not function.is_declaration:
+                manager, builder = self._codegen._function_pass_manager(opt=1)
+                manager.run(function, builder)
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._verify_declare_only_symbols()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Return null: there is no machine code."""
+        return 0
+
+    @property
+    def codegen(self) -> Any:
+        """Return a stand-in: the compiler would tell machine code its environment."""
+        return _NoMachineCode
+
+
+class _NoMachineCode:
+    @staticmethod
+    def set_env(env_name: str, env: object) -> None:
+        pass
+
+
+_IDLE = {
+    untyped_passes.WithLifting,
+    untyped_passes.InlineClosureLikes,
+    untyped_passes.FindLiterallyCalls,
+    untyped_passes.LiteralUnroll,
+    untyped_passes.LiteralPropagationSubPipelinePass,
+    typed_passes.InlineOverloads,
+    typed_passes.NopythonRewrites,
+    typed_passes.DumpParforDiagnostics,
+}
+"""Passes for what functions without arrays of their own do not have. What is defined within another has them."""
+
+
+class PartCompiler(compiler.Compiler):
+    """numba's compiler for functions that only kernels call."""
+
+    def define_pipelines(self) -> Any:
+        self.state.library = _part(self.state)
+        managers = super().define_pipelines()
+        if not any(isinstance(constant, CodeType) for constant in self.state.func_id.code.co_consts):
+            for manager in managers:
+                manager.passes = [(step, name) for step, name in manager.passes if step not in _IDLE]
+                manager.finalize()
+        return managers
+
+
+class KernelCompiler(compiler.Compiler):
+    """numba's compiler for a kernel."""
+
+    def compile_extra(self, func: Callable[..., object]) -> Any:
+        """Compile a kernel."""
+        with _replaced(*_quicker()):
+            return super().compile_extra(func)
+
+
+def _part(state: Any) -> _PartLibrary:
+    return _PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+
+
+@contextmanager
+def _replaced(*replacements: tuple[Any, str, object]) -> Iterator[None]:
+    """Replace attributes of objects, classes and modules, while a kernel is compiled under numba's lock."""
+    before = [(owner, name, vars(owner).get(name, _replaced)) for owner, name, _ in replacements]
+    for owner, name, value in replacements:
+        setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        for owner, name, value in before:
+            if value is _replaced:
+                delattr(owner, name)
+            else:
+                setattr(owner, name, value)
+
+
+def _quicker() -> tuple[tuple[Any, str, object], ...]:
+    """What numba does again and again, done once; what nobody waits for, not at all."""
+    from numba.core.typing.npydecl import NumpyRulesArrayOperator  # only compiling has a use for it
+
+    target = cpu_target.target_context
+    target.refresh()
+    first = next(iter(target._registries))  # where numba registers intrinsics as it meets them
+    define, wrap = compiler.Compiler.define_pipelines, target.create_cfunc_wrapper
+    list_vars, find_rule = ir.Inst._rec_list_vars, NumpyRulesArrayOperator.generic
+
+    def define_part(self: compiler.Compiler) -> Any:
+        # numba's own functions, which Python cannot call either.
+        if self.state.flags.no_cpython_wrapper and not isinstance(self.state.library, _PartLibrary):
+            self.state.library = _part(self.state)
+        return define(self)
+
+    def wrap_unless_part(library: JITCodeLibrary, *function: object) -> None:
+        if not isinstance(library, _PartLibrary):
+            wrap(library, *function)
+
+    def list_vars_sooner(instruction: ir.Inst, value: object) -> Any:
+        return () if type(value) in _NO_VARS else list_vars(instruction, value)
+
+    def find_rule_of_arrays(template: Any, args: tuple[types.Type, ...], kws: object) -> Any:
+        has_arrays = any(isinstance(kind, (types.ArrayCompatible, types.Optional)) for kind in args)
+        return find_rule(template, args, kws) if has_arrays else None
+
+    @cache
+    def abi_sizeof(kind: Type) -> int:
+        return int(kind.get_abi_size(target.target_data))
+
+    return (
+        (compiler.Compiler, "define_pipelines", define_part),
+        (target, "create_cfunc_wrapper", wrap_unless_part),
+        (target, "load_additional_registries", partial(target.install_registry, first)),
+        (target.typing_context, "load_additional_registries", _do_nothing),
+        (target, "get_abi_sizeof", abi_sizeof),
+        (event, "start_event", _do_nothing),
+        (event, "end_event", _do_nothing),
+        (ir.Inst, "_rec_list_vars", list_vars_sooner),
+        (NumpyRulesArrayOperator, "generic", find_rule_of_arrays),
+    )
+
+
+_NO_VARS = {ir.Loc, str, int, float, bool, type(None)}
+
+
+def _do_nothing(*args: object, **kwargs: object) -> None:
+    pass
