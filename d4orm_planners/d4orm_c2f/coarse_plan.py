@@ -202,14 +202,12 @@ class CoarsePlanning:
 
     Attributes:
         planner: Planner of the coarse plans.
-        judged: Whether these must pass ``verify()``: of cars it takes most of the time, in Python, which delays loops.
+        judged: Whether these must pass ``verify()``, which takes most of the time of cars, in Python, and delays loops.
     """
 
     def __init__(self, config: D4ormC2FConfig, seed: int, last_step: int | None) -> None:
-        self._config, self._seed, self._last_step = config, seed, last_step
-        self.judged = config.deadline is None
-        # Fine plans cannot keep to paths that fit between others to the centimetre. But where the team is stuck there
-        # may be no others.
+        self._config, self._seed, self._last_step, self.judged = config, seed, last_step, config.deadline is None
+        # Fine plans cannot keep to paths between others to the centimetre. Where the team is stuck there may be no others.
         self.planner, self._thorough = (_coarse_planner(config, reroute=reroute) for reroute in (False, True))
 
     def warm_start(self, problem: Problem, joint: JointState) -> FloatArray | None:

@@ -11,6 +11,9 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_planners.serve import wire
 from d4orm_planners.serve.wire import position_of
 
+BASE = 0.5
+"""Share of a period over which velocities are taken from poses."""
+
 
 @dataclass
 class FleetRobot:
@@ -29,15 +32,20 @@ class FleetRobot:
     posed: tuple[float, float, Floats] | None = None
     clock_resets: int = 0  #: Times that its clock was set back, or forward beyond the deadline
 
-    def take_pose(self, stamped: Any, now: float, base: float, deadline: float) -> None:
-        """Take the velocity from a ``geometry_msgs/PoseStamped`` and one that is older by ``base`` seconds at least.
+    def take_state(self, state: FloatArray, heading: float, now: float, age: float) -> None:
+        """Take a state ``(n,)`` and a heading [rad], measured ``age`` seconds ago."""
+        self.yaw = self.yaw if np.isfinite(self.heard) else heading
+        self.state, self.heading, self.heard, self.measured = state, heading, now, now - age
+
+    def take_pose(self, stamped: Any, now: float, period: float, deadline: float) -> None:
+        """Take the velocity from a ``geometry_msgs/PoseStamped`` and one that is older by half a period [s] at least.
 
         Where the robot's clock was set in between it stays as it is.
         """
         stamp, position = wire.time_of(stamped.header), position_of(stamped.pose.position)
         if self.posed is not None:
             passed, waited = stamp - self.posed[0], now - self.posed[1]
-            if 0 <= passed < base:
+            if 0 <= passed < BASE * period:
                 return
             if 0 < passed <= waited + deadline:
                 self.velocity = (position - self.posed[2]) / passed

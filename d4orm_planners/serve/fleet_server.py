@@ -22,13 +22,9 @@ from d4orm_planners.tracking.steering import braking_share
 
 NODE = "d4orm"
 DRIVING, BRAKING, PLANNING, WAITING, STOPPED = "driving", "braking", "planning", "waiting", "stopped"
-"""States of the server: robots drive; brake for replanning; are at rest for planning, for a silent robot, or after an
-emergency stop.
-"""
+"""States of the server: robots drive; brake for replanning; rest for planning, a silent robot or an emergency stop."""
 LEVELS = {DRIVING: 0, BRAKING: 0, PLANNING: 0, WAITING: 1, STOPPED: 2}
 """Levels of diagnostics: well, warning, error."""
-BASE = 0.5
-"""Share of a period over which velocities are taken from poses."""
 AT_REST = 0.05
 """Share of its largest speed up to which a robot that was stopped counts as at rest."""
 TELL = 1.0
@@ -165,7 +161,7 @@ class FleetServer:
                 self._hear(number, message.pose.pose, now, message.header, position_of(told.linear), told.angular.z)
             for message in self._poses[number].take():
                 if np.isfinite(position_of(message.pose.position)).all():
-                    robot.take_pose(message, now, BASE * self._problem.dt, self.deadline)
+                    robot.take_pose(message, now, self._problem.dt, self.deadline)
                     own = turned(robot.velocity, -wire.heading_of(message.pose.orientation))
                     self._hear(number, message.pose, now, message.header, own)
             for message in self._goals[number].take():
@@ -182,15 +178,11 @@ class FleetServer:
                     self._replan, self._pace, self._stops = True, 0.0, self._stops + 1
                     self._stand()
 
-    def _hear(
-        self, number: int, pose: Any, now: float, header: Any, velocity: Floats, turn_rate: float = np.nan
-    ) -> None:
+    def _hear(self, number: int, pose: Any, now: float, header: Any, velocity: Floats, rate: float = np.nan) -> None:
         age = max(time.time() - wire.time_of(header), 0.0) if self._stamped else 0.0
-        state, robot = wire.state_from(self._problem, number, pose, velocity, turn_rate), self._robots[number]
-        heading = wire.heading_of(pose.orientation)
+        state, heading = wire.state_from(self._problem, number, pose, velocity, rate), wire.heading_of(pose.orientation)
         if np.isfinite(heading) and np.isfinite(state[: self._problem.dimension]).all() and age <= self.deadline:
-            robot.yaw = robot.yaw if np.isfinite(robot.heard) else heading
-            robot.state, robot.heading, robot.heard, robot.measured = state, heading, now, now - age
+            self._robots[number].take_state(state, heading, now, age)
         else:
             self._unusable += 1
 
