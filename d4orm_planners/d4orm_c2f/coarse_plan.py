@@ -207,7 +207,7 @@ class CoarsePlanning:
 
     def __init__(self, config: D4ormC2FConfig, seed: int, last_step: int | None) -> None:
         self._config, self._seed, self._last_step, self.judged = config, seed, last_step, config.deadline is None
-        # Fine plans cannot keep to paths between others to the centimetre. Where the team is stuck there may be no others.
+        # Fine plans cannot keep to paths between others to the centimetre. If a team is stuck there may be no others.
         self.planner, self._thorough = (_coarse_planner(config, reroute=reroute) for reroute in (False, True))
 
     def warm_start(self, problem: Problem, joint: JointState) -> FloatArray | None:
