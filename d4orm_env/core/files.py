@@ -113,7 +113,7 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
     """Give a temporary path in the same folder; rename it to ``path`` at the end, or remove it after an error.
 
     A symbolic link stays one. A path that ends in none of the ``suffixes``, if there are any, is a ValueError, and one
-    that cannot be written to an FileAccessError that names it.
+    that cannot be written to a FileAccessError that names it.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         raise ValueError(f"{path} ends in {path.suffix!r}; choose one of {', '.join(suffixes)}")
