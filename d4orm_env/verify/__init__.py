@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import numbers_of
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Stretch
 from d4orm_env.verify.curves import CHORD_ERROR
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
@@ -186,9 +185,17 @@ class _Course:
 
 
 def _checked_controls(problem: Problem, controls: ArrayLike) -> Floats:
-    if hasattr(controls, "controls"):
-        raise ValueError(f"controls must be an array of numbers, not {type(controls).__name__}; give its controls")
-    array: Floats = numbers_of(controls, "controls must be an array of numbers", np.float64)
+    try:
+        given = np.asarray(controls)
+        objects = given.flat if given.dtype.kind == "O" else ()
+        if given.dtype.kind not in "fiuO" or any(isinstance(each, str | bytes | bool) for each in objects):
+            raise TypeError("text and truth are no numbers, and NumPy would drop imaginary parts")
+        array = given.astype(np.float64)
+    except OverflowError as error:
+        raise ValueError("controls hold a whole number too large for float64; keep them within the limits") from error
+    except (RuntimeError, TypeError, ValueError) as error:
+        remedy = "; give its controls" if hasattr(controls, "controls") else ""
+        raise ValueError(f"controls must be an array of numbers, not {type(controls).__name__}{remedy}") from error
     expected = (problem.horizon, len(problem.team.models), problem.team.control_size)
     if array.shape != expected:
         remedy = ""

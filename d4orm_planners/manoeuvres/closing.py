@@ -40,7 +40,7 @@ class Ends(NamedTuple):
     bounds: Floats  #: ``(2, m)`` of the controls
 
 
-class Space(NamedTuple):
+class GapSpace(NamedTuple):
     """Workspace for ``T`` steps."""
 
     states: Floats  #: ``(T + 1, n)``
@@ -53,7 +53,7 @@ class Space(NamedTuple):
     normal: Floats  #: ``(n, n + 1)`` normal equations
 
     @classmethod
-    def of(cls, steps: int, n: int, m: int) -> Space:
+    def of(cls, steps: int, n: int, m: int) -> GapSpace:
         """Workspace for a motion."""
         return cls(
             np.empty((steps + 1, n)), np.empty((steps, m, n)), np.empty((steps, m)), np.empty((steps, m), np.bool_),
@@ -113,7 +113,7 @@ def _solve(normal: Floats, solution: Floats) -> None:
 
 
 @compiled
-def _fill_normal(ends: Ends, gap: Floats, space: Space, first: int, count: int) -> None:
+def _fill_normal(ends: Ends, gap: Floats, space: GapSpace, first: int, count: int) -> None:
     """Write the normal equations of the free controls, for what those at bounds leave of the gap."""
     normal, n, trace = space.normal, gap.shape[0], 0.0
     normal[:] = 0.0
@@ -135,7 +135,7 @@ def _fill_normal(ends: Ends, gap: Floats, space: Space, first: int, count: int) 
 
 
 @compiled
-def _least_change(ends: Ends, controls: Floats, first: int, gap: Floats, multipliers: Floats, space: Space) -> None:
+def _least_change(ends: Ends, controls: Floats, first: int, gap: Floats, multipliers: Floats, space: GapSpace) -> None:
     """Change the controls as little as closes the gap as if effects were linear, none beyond its bounds."""
     count, change, free = controls.shape[0], space.change, space.free
     change[first:count], free[first:count] = 0.0, True
@@ -162,7 +162,7 @@ def _least_change(ends: Ends, controls: Floats, first: int, gap: Floats, multipl
 
 
 @compiled
-def _chain(space: Space, first: int) -> None:
+def _chain(space: GapSpace, first: int) -> None:
     """Carry the effect of a state on the last one back by a step; the first components' local effects are their own."""
     n = space.local.shape[0]
     for i in range(n):
@@ -194,7 +194,7 @@ def _stepper(model: Model) -> Any:
 
 
 @cache
-def gap_closer(name: str) -> Kernel[[Ends, Floats, int, Space], bool]:
+def gap_closer(name: str) -> Kernel[[Ends, Floats, int, GapSpace], bool]:
     """The kernel of robots of a model: changes controls ``(T, m)`` from a step on, so that they lead from the first
     state of the workspace to the goal, and fills in the other states; returns whether that worked.
     """
@@ -203,7 +203,7 @@ def gap_closer(name: str) -> Kernel[[Ends, Floats, int, Space], bool]:
 
     @compiled
     def differ(
-        ends: Ends, state: Floats, control: Floats, changed: Floats, at: int, following: Floats, space: Space
+        ends: Ends, state: Floats, control: Floats, changed: Floats, at: int, following: Floats, space: GapSpace
     ) -> None:  # fmt: skip
         """Write the derivative of the next state by a component of ``changed``, either the state or the control."""
         value, after = changed[at], space.rows[0]
@@ -215,7 +215,7 @@ def gap_closer(name: str) -> Kernel[[Ends, Floats, int, Space], bool]:
             after[i] = _wrapped(ends.angles[i], after[i] - following[i]) / difference
 
     @compiled
-    def find_effects(ends: Ends, controls: Floats, first: int, space: Space) -> None:
+    def find_effects(ends: Ends, controls: Floats, first: int, space: GapSpace) -> None:
         for i in range(n):
             for k in range(n):
                 space.onward[i, k] = 1.0 if i == k and ends.tolerance[i] < np.inf else 0.0
@@ -235,7 +235,7 @@ def gap_closer(name: str) -> Kernel[[Ends, Floats, int, Space], bool]:
             _chain(space, d)
 
     @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
-    def close_gap(ends: Ends, controls: Floats, first: int, space: Space) -> bool:
+    def close_gap(ends: Ends, controls: Floats, first: int, space: GapSpace) -> bool:
         gap, multipliers, states = np.empty(n), np.empty(n), space.states
         for sweep in range(SWEEPS + 1):
             for t in range(controls.shape[0]):

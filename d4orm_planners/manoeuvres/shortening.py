@@ -12,7 +12,7 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
-from d4orm_planners.manoeuvres.closing import Ends, Space, gap_closer
+from d4orm_planners.manoeuvres.closing import Ends, GapSpace, gap_closer
 from d4orm_planners.manoeuvres.kinds import MAX_STEPS
 from d4orm_planners.manoeuvres.nodes import Nodes, Task, arrives_after, is_sweep_free
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
@@ -46,7 +46,7 @@ def shortened(
 ) -> Motion:  # fmt: skip
     """A motion from a state that takes fewer steps, or the motion itself; it meets nobody if that does not."""
     model, controls, poses, failures = robot.model, motion.controls.astype(np.float64), motion.poses, 0
-    space, leave = Space.of(motion.steps, model.state_size, model.control_size), int(SHARE * motion.steps)
+    space, leave = GapSpace.of(motion.steps, model.state_size, model.control_size), int(SHARE * motion.steps)
     space.states[0], close_gap = start[: model.state_size], gap_closer(model.name)
     for _ in range(TRIES if motion.steps <= MAX_STEPS else 0):
         leave, steps = max(1, min(leave, len(controls) - 1)), 0

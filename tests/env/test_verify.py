@@ -365,7 +365,7 @@ def test_controls_that_are_not_numbers_are_an_error():
 
 def test_controls_too_large_for_a_float_are_an_error():
     problem = make(["velocity2d"], [(0, 0)], [(1, 0)], horizon=1)
-    with pytest.raises(ValueError, match=r"controls must be .* it holds a whole number too large"):
+    with pytest.raises(ValueError, match="controls hold a whole number too large for float64"):
         verify(problem, [[[10**400, 0]]])
 
 

@@ -412,9 +412,9 @@ def test_files_are_written_again_and_others_stay(plans: dict[str, Plan], tmp_pat
     [
         ("cvs", {}, "format 'cvs' is unknown; choose one of csv, crazyswarm2, rosbag2, mcap"),
         ("crazyswarm2", {}, "height is 0 m; a team that moves in the plane flies above 0: give height="),
-        ("csv", {"height": np.nan}, r"height is nan; it must be a number of at most 1e\+06 m in magnitude"),
-        ("csv", {"height": 1e300}, r"height is 1e\+300; it must be a number of at most"),
-        ("csv", {"height": "1"}, r"height is .1.; it must be a number of at most 1e\+06 m in magnitude"),
+        ("csv", {"height": np.nan}, r"height is nan; it must be at most 1e\+06 m in magnitude"),
+        ("csv", {"height": 1e300}, r"height is 1e\+300; it must be at most"),
+        ("csv", {"height": "1"}, "height must be a number, not .1."),
     ],
 )
 def test_bad_exports_are_refused_and_leave_nothing(

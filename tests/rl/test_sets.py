@@ -414,7 +414,7 @@ def test_a_network_of_sets_learns_where_nobody_is_seen(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "settings"), [("ppo", {"n_epochs": "7", "clip_range": 0.1}), ("sac", {"gradient_steps": 3, "tau": 1})]
+    ("algorithm", "settings"), [("ppo", {"n_epochs": 7, "clip_range": 0.1}), ("sac", {"gradient_steps": 3, "tau": 1})]
 )
 def test_a_learner_has_the_settings_asked_for(algorithm: str, settings: dict, tmp_path: Path) -> None:
     from stable_baselines3.common.vec_env import VecNormalize
@@ -429,7 +429,7 @@ def test_a_learner_has_the_settings_asked_for(algorithm: str, settings: dict, tm
 
 
 def test_rewards_are_those_asked_for() -> None:
-    settings = replace(TINY, reward_settings={"arrival": 7.5, "contact": "4"})
+    settings = replace(TINY, reward_settings={"arrival": 7.5, "contact": 4})
     assert (settings.reward.arrival, settings.reward.contact, settings.reward.time) == (7.5, 4, 0.05)
     flat = TrainingSettings(scenario="circle", num_robots=2, num_envs=2, reward_settings={"time": 1})
     for env in (settings.worlds(None), flat.worlds(Stage(2, "circle", 1))):  # type: ignore[arg-type]
