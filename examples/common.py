@@ -124,7 +124,7 @@ def steps_to_solution(trial: Trial) -> int | None:
 def denoising_time_share(trial: Trial) -> float | None:
     """Share of the time to the first solution, or to the last better plan, that denoising took, where it is told."""
     first = next((best for best in trial.progress if best.solved), None)
-    told = trial.denoising_time_share if first is None else first.denoising if first.steps else 0.0
+    told = trial.denoising_time_share if first is None else 0.0 if first.steps == 0 else first.denoising
     # A planner without such steps tells of none.
     return 0.0 if told is None and _iteration_steps(json.loads(trial.config)) is None else told
 
