@@ -18,11 +18,14 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d_d4orm.inbox import TOLERANCE, Evaluator, Inbox, Stopped, choose
+from d4orm_planners.d_d4orm.inbox import Evaluator, Inbox, Stopped, choose
 from d4orm_planners.d_d4orm.transport import Message, Transport, encode
 
 KINDS = ("computed", "sent", "received", "selected")
 """A node has made a candidate, sent it, got one, or chosen it to go on from."""
+
+ROUNDING = 1e-5
+"""Difference of rewards of one candidate that is clipped and evaluated again; two are hardly ever as near."""
 
 RESEND = 0.2
 """Seconds after which a candidate is sent again, as messages may get lost."""
@@ -190,7 +193,7 @@ class Node:
         """Check whether each of the others has sent a solution as good as this one."""
         found = {node: report.candidate for node, report in self.inbox.newest.items()}
         return all(
-            node in found and found[node].solved and found[node].reward >= candidate.reward - TOLERANCE
+            node in found and found[node].solved and found[node].reward >= candidate.reward - ROUNDING
             for node in self._others
         )
 

@@ -675,6 +675,24 @@ def test_settling_says_whether_all_others_have_a_solution_as_good() -> None:
     assert first.settle(0)
 
 
+def test_nodes_do_not_settle_for_solutions_that_are_nearly_as_good() -> None:
+    problem, network = hop_problem(2), LocalNetwork()
+    good = distributed().solve(problem).controls
+    evaluator = Evaluator(get_sampling_engine("cpu"), problem)
+    first, second = (
+        Node(i, PlanningTask(2, 0, share * good, "max", 1), cheap_planner("d4orm"), network.join(), evaluator)
+        for i, share in enumerate(np.float32([1, 0.9999]))
+    )
+    better, worse = first.search.best, second.search.best
+    assert better.solved
+    assert worse.solved
+    assert 1e-5 < better.reward - worse.reward < 1e-3
+    assert not second.settle(0), "nobody has told it anything"
+    assert not first.settle(0), "the other has told of its own"
+    assert second.settle(0)
+    assert first.settle(0)
+
+
 @pytest.mark.slow
 def test_an_asynchronous_node_waits_once_for_one_that_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     release = threading.Event()
