@@ -7,6 +7,7 @@ controls in physical units, so that a plan's controls ``(H, K, m)`` can be stepp
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 
 import gymnasium
 import numpy as np
@@ -103,10 +104,9 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
         return self._space(self.action_spaces, agent)
 
     def _space(self, spaces: Mapping[str, gymnasium.spaces.Box], agent: str) -> gymnasium.spaces.Box:
-        if agent not in self.possible_agents:
-            last = self.possible_agents[-1]
-            raise ValueError(f"agent {short_repr(agent)} is unknown; the agents are robot_0 to {last}")
-        return spaces[agent]
+        with suppress(KeyError, TypeError):
+            return spaces[agent]
+        raise ValueError(f"agent {short_repr(agent)} is unknown; the agents are robot_0 to {self.possible_agents[-1]}")
 
     def reset(
         self, seed: int | None = None, options: dict[str, object] | None = None
