@@ -35,11 +35,16 @@ def read_only(arrays: A) -> A:
     return arrays
 
 
-def as_float32(value: ArrayLike, dtype: type = np.float32) -> FloatArray:
+def as_float32(value: ArrayLike) -> FloatArray:
     """A new float32 array of ``value``, PyTorch's tensors included; what is too large for float32 becomes infinite.
 
     What cannot be read as numbers, or is a whole number that no float holds, is a ValueError.
     """
+    array: FloatArray = _as_floats(value, np.float32)
+    return array
+
+
+def _as_floats(value: ArrayLike, dtype: type) -> Any:
     try:
         with np.errstate(over="ignore"):
             return np.array(_detached(value), dtype)
@@ -68,9 +73,9 @@ def _detached(value: Any) -> Any:
 
 
 def numbers_of(value: ArrayLike, what: str, dtype: type = np.float32) -> Any:
-    """:func:`as_float32` of what a user gave; the error says ``what`` is wanted, as ``"goal must be numbers"``."""
+    """A new array of what a user gave, as :func:`as_float32`; errors say ``what`` it is: ``"goal must be numbers"``."""
     try:
-        return as_float32(value, dtype)
+        return _as_floats(value, dtype)
     except ValueError as error:
         raise ValueError(f"{what}, not {short_repr(value)}; {error}") from error
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, partial
 from types import CodeType
-from typing import Any
+from typing import Any, TypeAlias
 
 from llvmlite.ir import Type
 from numba.core import compiler, event, ir, typed_passes, types, untyped_passes
@@ -66,7 +66,7 @@ _IDLE = {
     typed_passes.NopythonRewrites,
     typed_passes.DumpParforDiagnostics,
 }
-"""Passes for what functions without arrays of their own do not have. What is defined within another has them."""
+"""Passes that kernels' functions have no use for, unless another is defined within one."""
 
 
 class PartCompiler(compiler.Compiler):
@@ -87,8 +87,12 @@ class KernelCompiler(compiler.Compiler):
 
     def compile_extra(self, func: Callable[..., object]) -> Any:
         """Compile a kernel."""
-        with _replaced(*_quicker()):
+        with _replaced(*_parts_of_numba(), *_done_once()):
             return super().compile_extra(func)
+
+
+Replacement: TypeAlias = tuple[Any, str, object]
+"""An object, class or module, the name of an attribute of it, and what takes its place."""
 
 
 def _part(state: Any) -> _PartLibrary:
@@ -96,8 +100,8 @@ def _part(state: Any) -> _PartLibrary:
 
 
 @contextmanager
-def _replaced(*replacements: tuple[Any, str, object]) -> Iterator[None]:
-    """Replace attributes of objects, classes and modules, while a kernel is compiled under numba's lock."""
+def _replaced(*replacements: Replacement) -> Iterator[None]:
+    """Replace attributes while a kernel is compiled under numba's lock."""
     before = [(owner, name, vars(owner).get(name, _replaced)) for owner, name, _ in replacements]
     for owner, name, value in replacements:
         setattr(owner, name, value)
@@ -111,18 +115,12 @@ def _replaced(*replacements: tuple[Any, str, object]) -> Iterator[None]:
                 setattr(owner, name, value)
 
 
-def _quicker() -> tuple[tuple[Any, str, object], ...]:
-    """What numba does again and again, done once; what nobody waits for, not at all."""
-    from numba.core.typing.npydecl import NumpyRulesArrayOperator  # only compiling has a use for it
-
+def _parts_of_numba() -> list[Replacement]:
+    """Replacements by which numba's own functions, which Python cannot call either, are parts of kernels."""
     target = cpu_target.target_context
-    target.refresh()
-    first = next(iter(target._registries))  # where numba registers intrinsics as it meets them
     define, wrap = compiler.Compiler.define_pipelines, target.create_cfunc_wrapper
-    list_vars, find_rule = ir.Inst._rec_list_vars, NumpyRulesArrayOperator.generic
 
     def define_part(self: compiler.Compiler) -> Any:
-        # numba's own functions, which Python cannot call either.
         if self.state.flags.no_cpython_wrapper and not isinstance(self.state.library, _PartLibrary):
             self.state.library = _part(self.state)
         return define(self)
@@ -130,6 +128,18 @@ def _quicker() -> tuple[tuple[Any, str, object], ...]:
     def wrap_unless_part(library: JITCodeLibrary, *function: object) -> None:
         if not isinstance(library, _PartLibrary):
             wrap(library, *function)
+
+    return [(compiler.Compiler, "define_pipelines", define_part), (target, "create_cfunc_wrapper", wrap_unless_part)]
+
+
+def _done_once() -> list[Replacement]:
+    """Replacements by which numba does once what it does again and again, and not at all what nobody waits for."""
+    from numba.core.typing.npydecl import NumpyRulesArrayOperator  # only compiling has a use for it
+
+    target = cpu_target.target_context
+    target.refresh()
+    first = next(iter(target._registries))  # where numba registers intrinsics as it meets them
+    list_vars, find_rule = ir.Inst._rec_list_vars, NumpyRulesArrayOperator.generic
 
     def list_vars_sooner(instruction: ir.Inst, value: object) -> Any:
         return () if type(value) in _NO_VARS else list_vars(instruction, value)
@@ -142,9 +152,7 @@ def _quicker() -> tuple[tuple[Any, str, object], ...]:
     def abi_sizeof(kind: Type) -> int:
         return int(kind.get_abi_size(target.target_data))
 
-    return (
-        (compiler.Compiler, "define_pipelines", define_part),
-        (target, "create_cfunc_wrapper", wrap_unless_part),
+    return [
         (target, "load_additional_registries", partial(target.install_registry, first)),
         (target.typing_context, "load_additional_registries", _do_nothing),
         (target, "get_abi_sizeof", abi_sizeof),
@@ -152,7 +160,7 @@ def _quicker() -> tuple[tuple[Any, str, object], ...]:
         (event, "end_event", _do_nothing),
         (ir.Inst, "_rec_list_vars", list_vars_sooner),
         (NumpyRulesArrayOperator, "generic", find_rule_of_arrays),
-    )
+    ]
 
 
 _NO_VARS = {ir.Loc, str, int, float, bool, type(None)}

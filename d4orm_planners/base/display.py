@@ -37,7 +37,7 @@ class DisplayMixin:
 
     @property
     def title(self) -> str:
-        """What it is, in a few words."""
+        """Name of it in a few words."""
         raise NotImplementedError
 
     @property

@@ -70,6 +70,16 @@ class Stopwatch:
             self._paused += time.perf_counter() - begin
 
 
+def _first_controls(problem: Problem, given: ArrayLike | None) -> FloatArray:
+    """``(H, K, m)`` as given, or zeros."""
+    if given is None:
+        return np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+    try:
+        return checked_controls(problem, given)
+    except ValueError as error:
+        raise ValueError(f"initial_controls: {error}") from None
+
+
 class SolveRun:
     """The state of a solve.
 
@@ -112,14 +122,7 @@ class SolveRun:
         self.problem = problem
         self.engine = engine or get_sampling_engine(planner.config.engine)
         self.seed = whole_number(seed, "seed", 0)
-        shape = (problem.horizon, problem.num_robots, problem.control_size)
-        if initial_controls is None:
-            controls = np.zeros(shape, np.float32)
-        else:
-            try:
-                controls = checked_controls(problem, initial_controls)
-            except ValueError as error:
-                raise ValueError(f"initial_controls: {error}") from None
+        controls = _first_controls(problem, initial_controls)
         self.watch = Stopwatch()
         with self.watch.paused():
             # The first rollout may compile.

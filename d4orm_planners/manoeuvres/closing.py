@@ -193,13 +193,9 @@ def _stepper(model: Model) -> Any:
     return step
 
 
-@cache
-def gap_closer(name: str) -> Kernel[[Ends, Floats, int, GapSpace], bool]:
-    """The kernel of robots of a model: changes controls ``(T, m)`` from a step on, so that they lead from the first
-    state of the workspace to the goal, and fills in the other states; returns whether that worked.
-    """
-    model = MODELS[name]
-    step, n, m, d = _stepper(model), model.state_size, model.control_size, model.dimension
+def _effect_finder(model: Model, step: Any) -> Any:
+    """Compiled ``(ends, controls, first, space)``: writes the effects of controls from ``first`` on."""
+    n, m, d = model.state_size, model.control_size, model.dimension
 
     @compiled
     def differ(
@@ -233,6 +229,18 @@ def gap_closer(name: str) -> Kernel[[Ends, Floats, int, GapSpace], bool]:
                 for i in range(n):
                     space.local[i, k] = derivative[i]
             _chain(space, d)
+
+    return find_effects
+
+
+@cache
+def gap_closer(name: str) -> Kernel[[Ends, Floats, int, GapSpace], bool]:
+    """The kernel of robots of a model: changes controls ``(T, m)`` from a step on, so that they lead from the first
+    state of the workspace to the goal, and fills in the other states; returns whether that worked.
+    """
+    model = MODELS[name]
+    step, n = _stepper(model), model.state_size
+    find_effects = _effect_finder(model, step)
 
     @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def close_gap(ends: Ends, controls: Floats, first: int, space: GapSpace) -> bool:

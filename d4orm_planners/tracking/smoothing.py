@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline
 
-from d4orm_env.core.arrays import Floats, as_float32, short_repr
+from d4orm_env.core.arrays import Floats, numbers_of, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE
@@ -90,7 +90,7 @@ def _each(name: str, value: ArrayLike | None, otherwise: Floats) -> Floats:
     if value is None:
         return otherwise
     try:
-        each: Floats = np.broadcast_to(as_float32(value, np.float64), otherwise.shape)
+        each: Floats = np.broadcast_to(numbers_of(value, name, np.float64), otherwise.shape)
     except ValueError:
         raise ValueError(
             f"{name} must be one number or one per robot ({len(otherwise)}), not {short_repr(value)}"

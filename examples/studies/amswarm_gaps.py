@@ -15,15 +15,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from examples.common import (
-    is_solved,
-    mean_text,
-    save_table,
-    solved_columns,
-    steps_to_solution,
-    study_trials,
-    trials_parser,
-)
+from examples.common import is_solved, mean_text, save_table, solved_columns, study_trials, trials_parser
+from examples.denoising import steps_to_solution
 
 from d4orm_env import Problem, make_problem
 from d4orm_planners.evaluation.store import Trial

@@ -13,16 +13,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.common import (
-    denoising_columns,
-    denoising_of,
-    each_row,
-    grouped,
-    mean_text,
-    save_table,
-    study_parser,
-    study_rows,
-)
+from examples.common import each_row, grouped, mean_text, save_table, study_parser, study_rows
+from examples.denoising import denoising_columns, denoising_of
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner

@@ -19,18 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.common import (
-    is_solved,
-    penalised_steps,
-    plt,
-    save_figure,
-    save_table,
-    solved_columns,
-    step_columns,
-    steps_to_solution,
-    study_trials,
-    trials_parser,
-)
+from examples.common import is_solved, plt, save_figure, save_table, solved_columns, study_trials, trials_parser
+from examples.denoising import penalised_steps, step_columns, steps_to_solution
 
 from d4orm_planners.evaluation.comparison import paired, survival
 from d4orm_planners.evaluation.store import Trial

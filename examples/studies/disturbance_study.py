@@ -21,18 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.common import (
-    loop_steps,
-    mean_text,
-    plt,
-    save_figure,
-    save_table,
-    solved_columns,
-    steps_to_solution,
-    study_trials,
-    text_of_told,
-    trials_parser,
-)
+from examples.common import mean_text, plt, save_figure, save_table, solved_columns, study_trials, trials_parser
+from examples.denoising import loop_steps, steps_to_solution, text_of_told
 from examples.studies import FIRST_SEED
 
 from d4orm_env.disturbances import (

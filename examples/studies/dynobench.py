@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.common import denoising_columns, denoising_of, grouped, save_table, study_parser, study_rows
+from examples.common import grouped, save_table, study_parser, study_rows
+from examples.denoising import denoising_columns, denoising_of
 
 from d4orm_env import Problem, load_dynobench
 from d4orm_env.scenarios import load_cl_mapf

@@ -29,18 +29,8 @@ from math import comb
 from typing import Any
 
 import numpy as np
-from examples.common import (
-    count,
-    denoising_columns,
-    denoising_of,
-    mean_text,
-    plt,
-    require,
-    save_figure,
-    save_table,
-    study_parser,
-    study_rows,
-)
+from examples.common import count, mean_text, plt, require, save_figure, save_table, study_parser, study_rows
+from examples.denoising import denoising_columns, denoising_of
 from examples.studies import AS_IN_THE_PAPER
 
 require("ipopt", "casadi")

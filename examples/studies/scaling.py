@@ -11,19 +11,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.common import (
-    COLOURS,
-    count,
-    denoising_columns,
-    denoising_of,
-    each_row,
-    grouped,
-    plt,
-    save_figure,
-    save_table,
-    study_parser,
-    study_rows,
-)
+from examples.common import COLOURS, count, each_row, grouped, plt, save_figure, save_table, study_parser, study_rows
+from examples.denoising import denoising_columns, denoising_of
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner

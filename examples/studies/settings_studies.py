@@ -19,12 +19,12 @@ from examples.common import (
     first_solutions,
     is_solved,
     mean_text,
-    penalised_steps,
     save_table,
     solved_columns,
     study_trials,
     trials_parser,
 )
+from examples.denoising import penalised_steps
 from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
 from examples.studies.paper import variants
 from examples.studies.tune_rivals import TEAMS as TUNED_ON

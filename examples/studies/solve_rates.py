@@ -19,7 +19,8 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.common import denoising_columns, denoising_of, grouped, save_table, study_parser, study_rows
+from examples.common import grouped, save_table, study_parser, study_rows
+from examples.denoising import denoising_columns, denoising_of
 
 from d4orm_env import Problem, make_problem, verify
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.common import count, is_solved, penalised_steps, save_table, study_parser
+from examples.common import count, is_solved, save_table, study_parser
+from examples.denoising import penalised_steps
 
 from d4orm_planners import make_planner
 from d4orm_planners.evaluation.evaluate import run_study

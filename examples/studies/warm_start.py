@@ -15,7 +15,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.common import denoising_columns, denoising_of, grouped, mean_text, save_table, study_parser, study_rows
+from examples.common import grouped, mean_text, save_table, study_parser, study_rows
+from examples.denoising import denoising_columns, denoising_of
 
 from d4orm_env import Problem, make_problem, navigation_v0
 from d4orm_planners import make_planner, make_policy, run_episode

@@ -16,7 +16,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from examples.common import denoising_columns, denoising_of, grouped, require, save_table, study_parser, study_rows
+from examples.common import grouped, require, save_table, study_parser, study_rows
+from examples.denoising import denoising_columns, denoising_of
 
 from d4orm_env import Problem, make_problem
 from d4orm_planners import Controller, Plan, make_planner

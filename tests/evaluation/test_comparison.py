@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from examples.common import holm, penalised_steps, steps_to_solution
+from examples.common import holm
+from examples.denoising import penalised_steps, steps_to_solution
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from trial_support import trial

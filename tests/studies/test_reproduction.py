@@ -13,14 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 import trial_support
-from examples.common import (
-    _with_corrected_tests,
-    denoising_columns,
-    denoising_of,
-    save_table,
-    steps_to_solution,
-    study_trials,
-)
+from examples.common import _with_corrected_tests, save_table, study_trials
+from examples.denoising import denoising_columns, denoising_of, steps_to_solution
 from examples.studies.paper import main
 from examples.studies.paper.figure import Figure, Group, Section, grouped
 from examples.studies.paper.figure_report import markdown, write_figure

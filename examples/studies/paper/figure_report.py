@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from examples.common import holm_by_family, steps_to_solution
+from examples.common import holm_by_family
+from examples.denoising import steps_to_solution
 from examples.studies.paper.figure import Figure, Group
 from examples.studies.paper.numbers import METRICS, Measured, column, first_solution, is_time, measured
 from examples.studies.paper.plots import draw

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from examples.common import denoising_time_shares, loop_steps, steps_spent, steps_to_solution, told_of
+from examples.denoising import denoising_time_shares, loop_steps, steps_spent, steps_to_solution, told_of
 from examples.studies.paper.figure import TIMES, Figure, Group
 
 from d4orm_planners.evaluation.store import Trial

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from examples.common import steps_spent, steps_to_solution
+from examples.denoising import steps_spent, steps_to_solution
 from examples.studies.paper.figure import Figure, Group
 from examples.studies.paper.numbers import Measured, column, first_solution
 
