@@ -29,20 +29,14 @@ DRONES = tuple(drone.value for drone in Drone)
 class DronePhysics:
     """The drones of a team in crazyflow.
 
-    Attributes:
-        drone: Their type, as crazyflow names it: ``"cf2x_L250"`` is the Crazyflie 2.x.
-        mass_factor: Their mass over that which their controller reckons with.
-        thrust_factor: Thrust of their rotors likewise: below 1 with a low battery.
-        gust: Force on every drone, in another random direction every 0.5 s [N].
-
     Raises:
         ValueError: For an unknown type, or a number out of range.
     """
 
-    drone: str = Drone.cf2x_L250.value
-    mass_factor: float = 1.0
-    thrust_factor: float = 1.0
-    gust: float = 0.0
+    drone: str = Drone.cf2x_L250.value  #: Their type, as crazyflow names it: ``"cf2x_L250"`` is the Crazyflie 2.x
+    mass_factor: float = 1.0  #: Their mass over that which their controller reckons with
+    thrust_factor: float = 1.0  #: Thrust of their rotors likewise: below 1 with a low battery
+    gust: float = 0.0  #: Force on every drone, in another random direction every 0.5 s [N]
 
     def __post_init__(self) -> None:
         check_choice(self.drone, "drone", DRONES)

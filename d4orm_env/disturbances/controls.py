@@ -103,12 +103,9 @@ class Bias(_Spread[Kept]):
 class Gain(Disturbance[Kept]):
     """Weaker or stronger motors: the controls of a robot times ``1 + std n``, at least zero, drawn per robot and
     episode. They are clipped to the limits afterwards.
-
-    Attributes:
-        std: Standard deviation of the factor.
     """
 
-    std: float = level(standard_deviation, off=0)
+    std: float = level(standard_deviation, off=0)  #: Standard deviation of the factor
 
     def begin(self, scene: Scene, draws: Draws) -> Kept:
         factors = 1 + np.float32(self.std) * draws.normal(scene.problem.num_robots, 1)
@@ -120,12 +117,9 @@ class Gain(Disturbance[Kept]):
 
 @dataclass(frozen=True)
 class Quantisation(Disturbance[Memory]):
-    """Controls in steps: each component is rounded to the nearest multiple of ``step``, halves to even.
+    """Controls in steps: each component is rounded to the nearest multiple of ``step``, halves to even."""
 
-    Attributes:
-        step: At least 1e-7, or zero [control units].
-    """
-
+    #: At least 1e-7, or zero [control units]
     step: float = level(partial(positive_number, zero_allowed=True, least=SMALLEST, most=LARGEST), off=0)
 
     def command(self, controls: FloatArray, memory: Memory, scene: Scene, draws: Draws) -> FloatArray:
@@ -144,12 +138,9 @@ def _steps_or_range(value: Any, name: str) -> int | tuple[int, int]:
 
 @dataclass(frozen=True)
 class Delay(Disturbance[Kept]):
-    """Commands are executed some time steps late; until the first one arrives, the control is zero.
+    """Commands are executed some time steps late; until the first one arrives, the control is zero."""
 
-    Attributes:
-        steps: Time steps, at most 1000. ``(1, 3)`` draws from 1, 2 and 3 anew for every robot and step.
-    """
-
+    #: Time steps, at most 1000. ``(1, 3)`` draws from 1, 2 and 3 anew for every robot and step.
     steps: int | tuple[int, int] = level(_steps_or_range, off=0)
 
     @property
@@ -175,11 +166,9 @@ class Lag(Disturbance[Kept]):
     """Slow actuators: what a robot does follows what it is told as a first-order system, from rest.
 
     A time step executes the mean of what happens in it.
-
-    Attributes:
-        time_constant: After it 63% of a change have happened; zero for none [s].
     """
 
+    #: After it 63% of a change have happened; zero for none [s]
     time_constant: float = level(standard_deviation, off=0)
 
     def begin(self, scene: Scene, draws: Draws) -> Kept:
@@ -196,14 +185,10 @@ class Lag(Disturbance[Kept]):
 
 @dataclass(frozen=True)
 class Dropout(Disturbance[Kept]):
-    """Commands get lost on their way, independently for every robot and step.
+    """Commands get lost on their way, independently for every robot and step."""
 
-    Attributes:
-        probability: That one is lost, from 0 to 1.
-        hold: Whether the robot goes on with the command that it got last, zero before the first; otherwise it brakes.
-    """
-
-    probability: float = level(share, off=0)
+    probability: float = level(share, off=0)  #: That one is lost, from 0 to 1
+    #: Whether the robot goes on with the command that it got last, zero before the first; otherwise it brakes
     hold: bool = level(truth, True)
 
     def begin(self, scene: Scene, draws: Draws) -> Kept:

@@ -54,16 +54,12 @@ class Intruder(Disturbance[Courses]):
     line passes through a random point between starts and goals in a random direction, but not where it would meet
     robots at rest at their starts or goals, for these cannot yield; if sixteen tries find no such line, it is the one
     that stays farthest from them.
-
-    Attributes:
-        count: Number of them, at most 100.
-        speed: [m/s].
-        radius: [m].
     """
 
+    #: Number of them, at most 100
     count: int = level(partial(whole_number, minimum=0, maximum=MAX_INTRUDERS), 1, off=0)
-    speed: float = level(standard_deviation, 0.5)
-    radius: float = level(_radius, 0.15)
+    speed: float = level(standard_deviation, 0.5)  #: [m/s]
+    radius: float = level(_radius, 0.15)  #: [m]
 
     @property
     def replayable(self) -> bool:
@@ -142,18 +138,13 @@ class MovingObstacle(Disturbance[Kept]):
     Between the times it moves on straight lines. It is absent before the first time and after the last, and where its
     position or the next one is NaN.
 
-    Attributes:
-        times: ``(T,)`` increasing, two or more, from the beginning of the episode [s].
-        positions: ``(T, d)``, or ``(T, N, d)`` of at most 100 bodies [m].
-        radius: [m].
-
     Raises:
         ValueError: If times do not increase, positions do not fit them or are half NaN, or the radius is not positive.
     """
 
-    times: ArrayLike
-    positions: ArrayLike
-    radius: float = level(_radius, 0.15)
+    times: ArrayLike  #: ``(T,)`` increasing, two or more, from the beginning of the episode [s]
+    positions: ArrayLike  #: ``(T, d)``, or ``(T, N, d)`` of at most 100 bodies [m]
+    radius: float = level(_radius, 0.15)  #: [m]
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -43,16 +43,12 @@ class StateNoise(Disturbance[Scales]):
 
     Bodies that are no robots are measured likewise. What the model of a robot has no state for is not measured but
     known from its controls, as the velocity of ``velocity2d``.
-
-    Attributes:
-        position_std: Standard deviation of positions, per axis [m].
-        velocity_std: Of velocities per axis, or of the speed where the model has only that [m/s].
-        heading_std: Of headings [rad].
     """
 
-    position_std: float = level(standard_deviation)
+    position_std: float = level(standard_deviation)  #: Standard deviation of positions, per axis [m]
+    #: Of velocities per axis, or of the speed where the model has only that [m/s]
     velocity_std: float = level(standard_deviation, 0.0)
-    heading_std: float = level(standard_deviation, 0.0)
+    heading_std: float = level(standard_deviation, 0.0)  #: Of headings [rad]
 
     @property
     def negligible(self) -> bool:
@@ -105,12 +101,9 @@ class Past(NamedTuple):
 class StateDelay(Disturbance[Past]):
     """Delay of measurements: states, and the controls executed last. Goals, who has arrived and the clock are known at
     once. Until the first measurement has come everything is seen as it began.
-
-    Attributes:
-        steps: Time steps, at most 1000.
     """
 
-    steps: int = level(partial(whole_number, minimum=0, maximum=MAX_DELAY), off=0)
+    steps: int = level(partial(whole_number, minimum=0, maximum=MAX_DELAY), off=0)  #: Time steps, at most 1000
 
     def begin(self, scene: Scene, draws: Draws) -> Past:
         parts, length = (scene.states, scene.controls, scene.bodies), self.steps + 1
@@ -130,11 +123,9 @@ class Occlusion(Disturbance[Memory]):
     """Sensors that do not reach far: a robot observes neither robots, bodies nor obstacles beyond their range.
 
     Robots tell each other where they are, so that ``env.state()`` lacks only the bodies that no robot has in range.
-
-    Attributes:
-        range: Distance of centres, for obstacles of the centre from their surface [m].
     """
 
+    #: Distance of centres, for obstacles of the centre from their surface [m]
     range: float = level(unless(math.inf, partial(positive_number, most=LARGEST)), math.inf, off=math.inf)
 
     def see(self, seen: Observed, memory: Memory, scene: Scene, draws: Draws) -> Observed:
@@ -163,12 +154,9 @@ class RayNoise(Disturbance[Memory]):
     """Gaussian noise on what range sensors measure, independent over steps, robots and rays.
 
     A ray that meets nothing reads the range as it is.
-
-    Attributes:
-        std: Standard deviation [m].
     """
 
-    std: float = level(standard_deviation, off=0)
+    std: float = level(standard_deviation, off=0)  #: Standard deviation [m]
 
     def observe(self, observations: FloatArray, layout: ObservationLayout, draws: Draws) -> FloatArray:
         rays = observations[..., layout.rays]

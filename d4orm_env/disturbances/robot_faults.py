@@ -39,14 +39,10 @@ class Push(Disturbance[Kept]):
     integrators take the velocity up as a whole. A robot that is driven by wheels takes up the part along its heading if
     it has inertia there; what a robot does not take up displaces it in that one time step. Docked robots
     are not pushed.
-
-    Attributes:
-        rate: Mean number of pushes of a robot per second [1/s].
-        speed: [m/s].
     """
 
-    rate: float = level(standard_deviation, 0.2, off=0)
-    speed: float = level(standard_deviation, 0.3, off=0)
+    rate: float = level(standard_deviation, 0.2, off=0)  #: Mean number of pushes of a robot per second [1/s]
+    speed: float = level(standard_deviation, 0.3, off=0)  #: [m/s]
 
     def slack(self, problem: Problem) -> BoundsSlack:
         return BoundsSlack(drift=self.speed)
@@ -109,16 +105,13 @@ class Stall(Disturbance[Stops]):
     at a time uniform over the first half of the episode's longest duration.
 
     One that stalls for good need not arrive for the episode to be a success; all others have to.
-
-    Attributes:
-        probability: That it happens to a robot in an episode, from 0 to 1.
-        duration: Time for which it stalls [s]; infinite for good.
-        robots: It may happen to so many only, chosen at random in every episode; to all by default.
-            ``Stall(1.0, robots=1)`` is one robot of the team that is sure to stall.
     """
 
-    probability: float = level(share, off=0)
+    probability: float = level(share, off=0)  #: That it happens to a robot in an episode, from 0 to 1
+    #: Time for which it stalls [s]; infinite for good
     duration: float = level(unless(math.inf, standard_deviation), math.inf, off=0)
+    #: It may happen to so many only, chosen at random in every episode; to all by default. ``Stall(1.0, robots=1)`` is
+    #: one robot of the team that is sure to stall.
     robots: int | None = level(unless(None, partial(whole_number, minimum=1)), None)
 
     @property
@@ -160,12 +153,9 @@ class Drag(Disturbance[Memory]):
     """Friction of a fluid, linear in the speed: it adds ``dv/dt = -coefficient v`` to what the control does.
 
     Taken exactly at the beginning of every step, ``v <- exp(-coefficient dt) v``, the control after it (Lie splitting).
-
-    Attributes:
-        coefficient: [1/s].
     """
 
-    coefficient: float = level(standard_deviation, off=0)
+    coefficient: float = level(standard_deviation, off=0)  #: [1/s]
 
     def check(self, problem: Problem) -> None:
         for robot, model in enumerate(problem.team.robot_models):
@@ -188,12 +178,9 @@ class Drag(Disturbance[Memory]):
 class LimitMismatch(Disturbance[Memory]):
     """Robots weaker than believed: their limits of speed, acceleration and turn rate are truly ``factor`` times those
     that the problem says and observations show.
-
-    Attributes:
-        factor: Above 0, at most 1.
     """
 
-    factor: float = level(partial(positive_number, least=1e-3, most=1.0), off=1)
+    factor: float = level(partial(positive_number, least=1e-3, most=1.0), off=1)  #: Above 0, at most 1
 
     def limits(self, limits: FloatArray) -> FloatArray:
         limits = limits.copy()

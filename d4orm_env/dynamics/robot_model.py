@@ -123,17 +123,11 @@ class ModelFunctions(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """A limit or measure of its own that a model has, positive.
+    """A limit or measure of its own that a model has, positive."""
 
-    Attributes:
-        name: As in ``Team(own_limits={name: ...})``.
-        default: For robots that are given no other, in SI units; may be :data:`UNLIMITED`.
-        most: Largest value.
-    """
-
-    name: str
-    default: float
-    most: float = math.inf
+    name: str  #: As in ``Team(own_limits={name: ...})``
+    default: float  #: For robots that are given no other, in SI units; may be :data:`UNLIMITED`
+    most: float = math.inf  #: Largest value
 
 
 # ``x + h * k`` for states of two to six components, written out for the compiler.
@@ -184,41 +178,31 @@ class RungeKutta:
 
 @dataclass(frozen=True)
 class Model:
-    """A robot model: its sizes, the meaning of its components and its functions.
+    """A robot model: its sizes, the meaning of its components and its functions."""
 
-    Attributes:
-        name: Registry name, an identifier.
-        dimension: Position dimensions ``d``, 2 or 3; the first ``d`` state components are the position [m].
-        state_names: One name per state component; ``len`` is the model's state size ``n``, ``d`` to 6.
-        control_names: One name per control component; ``len`` is the model's control size ``m``, 2 or 3.
-        control_limits: Column of the limits that bounds each control component; those with one column by their norm.
-        heading_index: State component holding the heading [rad], or ``None`` for a model without one.
-        speed_indices: State components holding velocity or speed [m/s].
-        functions: The scalar-style functions.
-        own_limits: Limits beyond the three that all models have, from column :data:`OWN_LIMITS` on.
-        state_limits: ``(state component, column of the limits)`` for components other than speeds that
-            :attr:`ModelFunctions.limit_state` bounds; those with the same column by their norm.
-        lower_limits: ``(column, column of its own)`` for limits that hold for positive values only, such as a speed
-            forwards: the second one's bounds the magnitude of negative values, such as a speed backwards.
-        trailers: ``(state component of its hitch angle, column of its hitch's length)`` of each, from the front on; the
-            angle is what its heading lags behind that of the body before it.
-        own_angles: State components other than the heading that are angles, which do not wind up either.
-        start_angles: Those of them that are the heading where a scenario starts the robot; others are 0.
-    """
-
-    name: str
-    dimension: int
-    state_names: tuple[str, ...]
-    control_names: tuple[str, ...]
+    name: str  #: Registry name, an identifier
+    dimension: int  #: Position dimensions ``d``, 2 or 3; the first ``d`` state components are the position [m]
+    state_names: tuple[str, ...]  #: One name per state component; ``len`` is the model's state size ``n``, ``d`` to 6
+    control_names: tuple[str, ...]  #: One name per control component; ``len`` is the model's control size ``m``, 2 or 3
+    #: Column of the limits that bounds each control component; those with one column by their norm
     control_limits: tuple[int, ...]
-    heading_index: int | None
-    speed_indices: tuple[int, ...]
-    functions: ModelFunctions
+    heading_index: int | None  #: State component holding the heading [rad], or ``None`` for a model without one
+    speed_indices: tuple[int, ...]  #: State components holding velocity or speed [m/s]
+    functions: ModelFunctions  #: The scalar-style functions
+    #: Limits beyond the three that all models have, from column :data:`OWN_LIMITS` on
     own_limits: tuple[Limit, ...] = ()
+    #: ``(state component, column of the limits)`` for components other than speeds that
+    #: :attr:`ModelFunctions.limit_state` bounds; those with the same column by their norm
     state_limits: tuple[tuple[int, int], ...] = ()
+    #: ``(column, column of its own)`` for limits that hold for positive values only, such as a speed forwards: the
+    #: second one's bounds the magnitude of negative values, such as a speed backwards
     lower_limits: tuple[tuple[int, int], ...] = ()
+    #: ``(state component of its hitch angle, column of its hitch's length)`` of each, from the front on; the angle is
+    #: what its heading lags behind that of the body before it
     trailers: tuple[tuple[int, int], ...] = ()
+    #: State components other than the heading that are angles, which do not wind up either
     own_angles: tuple[int, ...] = ()
+    #: Those of them that are the heading where a scenario starts the robot; others are 0
     start_angles: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:

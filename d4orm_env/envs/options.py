@@ -35,63 +35,48 @@ OBSERVATION = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EnvOptions:
-    """Options of an environment; every environment takes these as keyword arguments.
+    """Options of an environment; every environment takes these as keyword arguments."""
 
-    Attributes:
-        scenario: ``"circle"`` unless a problem is given. The name of a scenario, the path of a YAML file, a callable
-            ``(seed, num_robots, **settings) -> Problem``, or where to import one, ``"package.module:function"``.
-        num_robots: Size of the team; the scenario's default (8 for most) unless given.
-        problem: The problem to run instead of a scenario.
-        render_mode: ``"rgb_array"``, ``"human"`` or ``None``.
-        control_noise_std: Standard deviation of Gaussian execution noise, in the controls' units, for all components
-            or one per component, added before the control is clipped: short for ``ControlNoise(std)`` as the first of
-            the disturbances.
-        disturbances: Disturbances, in the order in which they act: instances of :mod:`d4orm_env.disturbances`, or of
-            subclasses of your own. Those at level zero leave the environment as it is.
-        lifelong: A robot that arrives gets a fresh random goal, keeps moving and is not terminated, and so may arrive
-            at any speed unless ``goal_speed`` is given; its info says ``arrived`` at that step, and
-            ``distance_to_goal`` is to the new goal. A :data:`~d4orm_env.envs.lifelong.GoalFunction` gives the goals.
-        max_cycles: Steps until truncation; the problem's horizon unless given.
-        randomize_instance: Draw a new instance of the scenario at every reset. By default wherever the scenario draws
-            at random, that is, where another seed gives another problem; ``False`` keeps the one of ``seed=``.
-        reward: ``"paper"``, ``"training"`` (:class:`~d4orm_env.envs.rewards.TrainingReward`), or a function from a
-            :class:`~d4orm_env.envs.rewards.RewardInput` to the rewards ``(..., K)`` of all robots.
-        progress: Distances of rewards, the paper's among them: ``"straight"``, or the length of the
-            shortest free ``"path"``, see :mod:`d4orm_env.paths.shortest_paths`; the same in a world without obstacles.
-            Not for ``lifelong``.
-        observed_path: Whether an observation ends with direction and length of the shortest path. Not for
-            ``lifelong``.
-        observed_robots: Nearest robots in an observation; missing ones are marked absent.
-        observed_obstacles: Nearest obstacles in an observation; likewise.
-        observed_rays: Rays of each robot's range sensor (a planar lidar) in an observation; not in space.
-        ray_range: Range of that [m]; noise is :class:`~d4orm_env.disturbances.RayNoise`.
-        communication_range: Distance of centres beyond which no neighbour is observed [m]; ``None`` for no limit.
-        line_of_sight: Whether neighbours behind obstacles are not observed either; not in space.
-        egocentric: Whether observations are :class:`~d4orm_env.envs.features.Features`, seen from where the robot faces
-            its goal and of order one, and actions are in ``[-1, 1]``, in units of the limits and in that frame: what
-            learns. Policies act in environments without it.
-        scenario_settings: Arguments of the scenario, such as ``model`` or ``seed``: all other keyword arguments.
-    """
-
+    #: ``"circle"`` unless a problem is given. The name of a scenario, the path of a YAML file, a callable ``(seed,
+    #: num_robots, **settings) -> Problem``, or where to import one, ``"package.module:function"``.
     scenario: ScenarioLike | None = None
-    num_robots: int | None = None
-    problem: Problem | None = None
-    render_mode: str | None = None
+    num_robots: int | None = None  #: Size of the team; the scenario's default (8 for most) unless given
+    problem: Problem | None = None  #: The problem to run instead of a scenario
+    render_mode: str | None = None  #: ``"rgb_array"``, ``"human"`` or ``None``
+    #: Standard deviation of Gaussian execution noise, in the controls' units, for all components or one per component,
+    #: added before the control is clipped: short for ``ControlNoise(std)`` as the first of the disturbances
     control_noise_std: ArrayLike = 0.0
+    #: Disturbances, in the order in which they act: instances of :mod:`d4orm_env.disturbances`, or of subclasses of
+    #: your own. Those at level zero leave the environment as it is.
     disturbances: Sequence[AnyDisturbance] = ()
+    #: A robot that arrives gets a fresh random goal, keeps moving and is not terminated, and so may arrive at any speed
+    #: unless ``goal_speed`` is given; its info says ``arrived`` at that step, and ``distance_to_goal`` is to the new
+    #: goal. A :data:`~d4orm_env.envs.lifelong.GoalFunction` gives the goals.
     lifelong: bool | GoalFunction = False
-    max_cycles: int | None = None
+    max_cycles: int | None = None  #: Steps until truncation; the problem's horizon unless given
+    #: Draw a new instance of the scenario at every reset. By default wherever the scenario draws at random, that is,
+    #: where another seed gives another problem; ``False`` keeps the one of ``seed=``.
     randomize_instance: bool | None = None
+    #: ``"paper"``, ``"training"`` (:class:`~d4orm_env.envs.rewards.TrainingReward`), or a function from a
+    #: :class:`~d4orm_env.envs.rewards.RewardInput` to the rewards ``(..., K)`` of all robots
     reward: str | RewardFunction = "paper"
+    #: Distances of rewards, the paper's among them: ``"straight"``, or the length of the shortest free ``"path"``, see
+    #: :mod:`d4orm_env.paths.shortest_paths`; the same in a world without obstacles. Not for ``lifelong``.
     progress: str = "straight"
+    #: Whether an observation ends with direction and length of the shortest path. Not for ``lifelong``.
     observed_path: bool = False
-    observed_robots: int = 4
-    observed_obstacles: int = 4
-    observed_rays: int = 0
-    ray_range: float = 5.0
+    observed_robots: int = 4  #: Nearest robots in an observation; missing ones are marked absent
+    observed_obstacles: int = 4  #: Nearest obstacles in an observation; likewise
+    observed_rays: int = 0  #: Rays of each robot's range sensor (a planar lidar) in an observation; not in space
+    ray_range: float = 5.0  #: Range of that [m]; noise is :class:`~d4orm_env.disturbances.RayNoise`
+    #: Distance of centres beyond which no neighbour is observed [m]; ``None`` for no limit
     communication_range: float | None = None
-    line_of_sight: bool = False
+    line_of_sight: bool = False  #: Whether neighbours behind obstacles are not observed either; not in space
+    #: Whether observations are :class:`~d4orm_env.envs.features.Features`, seen from where the robot faces its goal and
+    #: of order one, and actions are in ``[-1, 1]``, in units of the limits and in that frame: what learns. Policies act
+    #: in environments without it.
     egocentric: bool = False
+    #: Arguments of the scenario, such as ``model`` or ``seed``: all other keyword arguments
     scenario_settings: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod

@@ -121,25 +121,19 @@ class TrainingReward:
     arrival: a policy that learns from it does not arrive. This one pays progress, which is a potential (A. Y. Ng,
     D. Harada and S. Russell, ICML 1999), and the arrival.
 
-    Attributes:
-        progress: For every step's distance at full speed towards the goal, and turn at the largest turn rate towards
-            the goal heading, as far as the robot has to turn on its way by the goal.
-        arrival: Once, on arriving.
-        margin: Taken off in every step within the margin of anything.
-        contact: Taken off in every step in contact with anything.
-        time: Taken off in every step.
-
     The infos of the environments have each term as it was paid, ``reward_progress`` and so on.
 
     Raises:
         ValueError: If a weight is negative or no number: a negative price would pay for contacts.
     """
 
+    #: For every step's distance at full speed towards the goal, and turn at the largest turn rate towards the goal
+    #: heading, as far as the robot has to turn on its way by the goal
     progress: float = 0.3
-    arrival: float = 5.0
-    margin: float = 1.0
-    contact: float = 3.0
-    time: float = 0.05
+    arrival: float = 5.0  #: Once, on arriving
+    margin: float = 1.0  #: Taken off in every step within the margin of anything
+    contact: float = 3.0  #: Taken off in every step in contact with anything
+    time: float = 0.05  #: Taken off in every step
     term_names: ClassVar[tuple[str, ...]] = ("progress", "arrival", "margin", "contact", "time")
 
     def __post_init__(self) -> None:

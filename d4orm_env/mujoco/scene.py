@@ -26,24 +26,17 @@ _MOST = {"time_step": 0.02, "wheel_friction": 10.0, "body_friction": 10.0, "sett
 class Physics:
     """The bodies of a team in MuJoCo. The defaults are those of small laboratory robots.
 
-    Attributes:
-        time_step: Longest step of MuJoCo [s]; a time step of the problem is divided evenly. At most 0.02.
-        drag: Of pucks, linear in their velocity, per mass [1/s]; what a planner does not know of.
-        wheel_friction: Coulomb friction coefficient between wheels and floor.
-        body_friction: The same between robots, and between robots and obstacles.
-        settling_time: Time constant of the low-level speed controllers [s]; see
-            :class:`~d4orm_env.mujoco.bodies.WheelControl`.
-        surface_density: Mass of a robot over the square of its radius [kg/m^2]; 100 is 2.25 kg for a radius of 0.15 m.
-
     Raises:
         ValueError: For a number out of range.
     """
 
-    time_step: float = 0.005
-    drag: float = 0.2
-    wheel_friction: float = 0.8
-    body_friction: float = 0.3
+    time_step: float = 0.005  #: Longest step of MuJoCo [s]; a time step of the problem is divided evenly. At most 0.02.
+    drag: float = 0.2  #: Of pucks, linear in their velocity, per mass [1/s]; what a planner does not know of
+    wheel_friction: float = 0.8  #: Coulomb friction coefficient between wheels and floor
+    body_friction: float = 0.3  #: The same between robots, and between robots and obstacles
+    #: Time constant of the low-level speed controllers [s]; see :class:`~d4orm_env.mujoco.bodies.WheelControl`
     settling_time: float = 0.03
+    #: Mass of a robot over the square of its radius [kg/m^2]; 100 is 2.25 kg for a radius of 0.15 m
     surface_density: float = 100.0
 
     def __post_init__(self) -> None:

@@ -123,18 +123,13 @@ def _checked_goals(problem: Problem, goals: ArrayLike, moments: int) -> FloatArr
 class Replay:
     """Motions side by side on one page, with one clock; notebooks show it where it is the last value of a cell.
 
-    Attributes:
-        title: Title of the page.
-        motions: Motions that it shows, one or more.
-        autoplay: Whether it plays when it is opened.
-
     Raises:
         ValueError: If there is none.
     """
 
-    title: str
-    motions: tuple[ReplayMotion, ...]
-    autoplay: bool = False
+    title: str  #: Title of the page
+    motions: tuple[ReplayMotion, ...]  #: Motions that it shows, one or more
+    autoplay: bool = False  #: Whether it plays when it is opened
 
     def __post_init__(self) -> None:
         if not self.motions:

@@ -65,31 +65,20 @@ class Block(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """A comparison, and its table.
+    """A comparison, and its table."""
 
-    Attributes:
-        about: A description for ``--help``.
-        column: Head of the column of labels.
-        blocks: Makes the blocks, whose rows follow each other.
-        quick: Settings of the quick version.
-        quick_robots: Its team size; ``None`` is that of the first block, which is all there is.
-        first_seed: Of every row; no default was chosen by seeds from ``FIRST_SEED`` on.
-        team: Format of the name of a team, of a trial's attributes.
-        rows: Makes the rows of a block.
-        study: Further arguments of the studies.
-        mark: What the reference is called in addition.
-    """
-
-    about: str
-    column: str
-    blocks: Callable[[], Sequence[Block]]
+    about: str  #: A description for ``--help``
+    column: str  #: Head of the column of labels
+    blocks: Callable[[], Sequence[Block]]  #: Makes the blocks, whose rows follow each other
+    #: Settings of the quick version
     quick: dict[str, Any] = {"max_iterations": 1, "num_steps": 20}  # noqa: RUF012 - never changed
-    quick_robots: int | None = 2
-    first_seed: int = FIRST_SEED
-    team: str = "{0.scenario}, {0.num_robots} robots"
+    quick_robots: int | None = 2  #: Its team size; ``None`` is that of the first block, which is all there is
+    first_seed: int = FIRST_SEED  #: Of every row; no default was chosen by seeds from ``FIRST_SEED`` on
+    team: str = "{0.scenario}, {0.num_robots} robots"  #: Format of the name of a team, of a trial's attributes
+    #: Makes the rows of a block
     rows: Callable[[str, str, dict[str, list[Trial]], str], list[dict[str, Any]]] = first_solutions
-    study: Mapping[str, Any] = {}
-    mark: str = ""
+    study: Mapping[str, Any] = {}  #: Further arguments of the studies
+    mark: str = ""  #: What the reference is called in addition
 
     def blocks_of(self, quick: bool) -> list[Block]:
         """The blocks, or those of the quick version."""

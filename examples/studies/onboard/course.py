@@ -33,23 +33,14 @@ DRIFT = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """A plan under way; where it ends, the robots stand.
+    """A plan under way; where it ends, the robots stand."""
 
-    Attributes:
-        begin: Tick at which it begins.
-        controls: ``(T, K, m)``.
-        states: ``(T+1, K, n)``.
-        goals: ``(K, d)`` that it was made for.
-        digest: Its digest.
-        reward: Its reward by the planner.
-    """
-
-    begin: int
-    controls: Any
-    states: Any
-    goals: Any
-    digest: str
-    reward: float = 0.0
+    begin: int  #: Tick at which it begins
+    controls: Any  #: ``(T, K, m)``
+    states: Any  #: ``(T+1, K, n)``
+    goals: Any  #: ``(K, d)`` that it was made for
+    digest: str  #: Its digest
+    reward: float = 0.0  #: Its reward by the planner
 
     @classmethod
     def standing(cls, problem: Problem, tick: int, states: Any) -> Course:

@@ -24,40 +24,24 @@ ROOM = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class Mission:
-    """The settings of one run.
+    """The settings of one run."""
 
-    Attributes:
-        robots: Number of robots.
-        seed: Of starts, goals and planning.
-        samples: Of all robots together in an iteration; each draws its share.
-        timeout: Seconds that the world waits for a robot's command before it is given up.
-        namespace: Of the run on the network.
-        world: Endpoint that the world listens at for the robots.
-        team: Endpoint on which the robots find each other.
-        side: Side of the square that they drive in [m].
-        horizon: Steps of a plan.
-        denoising_steps: ``N`` of an iteration.
-        iterations: Of a round, at least; where they take longer than real time allows, the clock waits for them.
-        think: Ticks that a round of planning is given.
-        agree: Ticks from then on until the best plan, which the robots agree on meanwhile, takes over; at least 3: to
-            end, to announce the best and to settle on one.
-        silence: Seconds without a message from the world after which a robot ends.
-    """
-
-    robots: int
-    seed: int
-    samples: int
-    timeout: float
-    namespace: str
-    world: str
-    team: str
-    side: float = 4.0
-    horizon: int = 80
-    denoising_steps: int = 50
-    iterations: int = 2
-    think: int = 7
+    robots: int  #: Number of robots
+    seed: int  #: Of starts, goals and planning
+    samples: int  #: Of all robots together in an iteration; each draws its share
+    timeout: float  #: Seconds that the world waits for a robot's command before it is given up
+    namespace: str  #: Of the run on the network
+    world: str  #: Endpoint that the world listens at for the robots
+    team: str  #: Endpoint on which the robots find each other
+    side: float = 4.0  #: Side of the square that they drive in [m]
+    horizon: int = 80  #: Steps of a plan
+    denoising_steps: int = 50  #: ``N`` of an iteration
+    iterations: int = 2  #: Of a round, at least; where they take longer than real time allows, the clock waits for them
+    think: int = 7  #: Ticks that a round of planning is given
+    #: Ticks from then on until the best plan, which the robots agree on meanwhile, takes over; at least 3: to end, to
+    #: announce the best and to settle on one
     agree: int = 3
-    silence: float = 30.0
+    silence: float = 30.0  #: Seconds without a message from the world after which a robot ends
 
     @property
     def round_ticks(self) -> int:
@@ -99,44 +83,27 @@ _STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
 @dataclass(frozen=True)
 class Tick:
-    """Message of the world to all robots.
+    """Message of the world to all robots."""
 
-    Attributes:
-        number: Ticks since the start; -1 for the last message, which ends the run.
-        state: The joint state, see :mod:`d4orm_env.envs.joint_state`.
-        lost: Robots that have been given up; they stand where they stopped.
-        ballots: Plan that each robot announced last as its choice, ``""`` for none.
-        rewards: Rewards of those.
-    """
-
-    number: int
-    state: list[float]
-    lost: list[int]
-    ballots: list[str]
-    rewards: list[float]
+    number: int  #: Ticks since the start; -1 for the last message, which ends the run
+    state: list[float]  #: The joint state, see :mod:`d4orm_env.envs.joint_state`
+    lost: list[int]  #: Robots that have been given up; they stand where they stopped
+    ballots: list[str]  #: Plan that each robot announced last as its choice, ``""`` for none
+    rewards: list[float]  #: Rewards of those
     kind: Literal["Tick"] = "Tick"
     __pydantic_config__ = _STRICT
 
 
 @dataclass(frozen=True)
 class Command:
-    """Message of a robot in a tick.
+    """Message of a robot in a tick."""
 
-    Attributes:
-        number: The tick.
-        robot: Its number.
-        control: ``(m,)``.
-        ballot: Digest of the plan that it would take over next, ``""`` for none.
-        reward: Its reward.
-        executing: Digest of the plan that it executes.
-    """
-
-    number: int
-    robot: int
-    control: list[float]
-    ballot: str
-    reward: float
-    executing: str
+    number: int  #: The tick
+    robot: int  #: Its number
+    control: list[float]  #: ``(m,)``
+    ballot: str  #: Digest of the plan that it would take over next, ``""`` for none
+    reward: float  #: Its reward
+    executing: str  #: Digest of the plan that it executes
     kind: Literal["Command"] = "Command"
     __pydantic_config__ = _STRICT
 

@@ -91,21 +91,13 @@ SEQUENCE = 10_000
 
 @dataclass(frozen=True)
 class Agenda:
-    """Task of a round of planning.
+    """Task of a round of planning."""
 
-    Attributes:
-        number: Of the round; later ones have larger numbers.
-        members: The robots that are alive, whose nodes are numbered in this order.
-        takeover: Tick at which the plan begins.
-        problem: The problem that begins then.
-        guess: ``(H, K, m)`` controls to start from.
-    """
-
-    number: int
-    members: tuple[int, ...]
-    takeover: int
-    problem: Problem
-    guess: FloatArray
+    number: int  #: Of the round; later ones have larger numbers
+    members: tuple[int, ...]  #: The robots that are alive, whose nodes are numbered in this order
+    takeover: int  #: Tick at which the plan begins
+    problem: Problem  #: The problem that begins then
+    guess: FloatArray  #: ``(H, K, m)`` controls to start from
 
 
 class Round:

@@ -33,25 +33,15 @@ START = 300.0
 
 @dataclass
 class Record:
-    """Record of a run, tick by tick.
+    """Record of a run, tick by tick."""
 
-    Attributes:
-        joints: The joint states, one more than steps.
-        reached: ``(K,)`` who reached a goal, per step.
-        collided: ``(K,)`` who touched something, per step.
-        executing: Plans that the robots said they execute, per step.
-        lost: Robots that had been given up, per step.
-        began: Time at which each tick began, by :func:`time.perf_counter` [s].
-        answered: Seconds until all had answered, per step.
-    """
-
-    joints: list[JointState] = field(default_factory=list)
-    reached: list[Any] = field(default_factory=list)
-    collided: list[Any] = field(default_factory=list)
-    executing: list[set[str]] = field(default_factory=list)
-    lost: list[list[int]] = field(default_factory=list)
-    began: list[float] = field(default_factory=list)
-    answered: list[float] = field(default_factory=list)
+    joints: list[JointState] = field(default_factory=list)  #: The joint states, one more than steps
+    reached: list[Any] = field(default_factory=list)  #: ``(K,)`` who reached a goal, per step
+    collided: list[Any] = field(default_factory=list)  #: ``(K,)`` who touched something, per step
+    executing: list[set[str]] = field(default_factory=list)  #: Plans that the robots said they execute, per step
+    lost: list[list[int]] = field(default_factory=list)  #: Robots that had been given up, per step
+    began: list[float] = field(default_factory=list)  #: Time at which each tick began, by :func:`time.perf_counter` [s]
+    answered: list[float] = field(default_factory=list)  #: Seconds until all had answered, per step
 
     @property
     def steps(self) -> int:

@@ -39,20 +39,15 @@ EFFORTS = frozenset({"survival", "anytime"})
 
 @dataclass(frozen=True, kw_only=True)
 class Section(Study):
-    """A study whose policies meet the same problems: a panel of a figure, or a table.
+    """A study whose policies meet the same problems: a panel of a figure, or a table."""
 
-    Attributes:
-        title: The paper's name of it.
-        quick_robots: Team sizes of the quick version.
-        nodes: Numbers of nodes that every policy is run with; none leaves it to their other settings.
-    """
-
-    title: str
+    title: str  #: The paper's name of it
     policies: Mapping[str, Mapping[str, object]]
     scenarios: tuple[str, ...]
     num_robots: tuple[int | None, ...] = (None,)
     control_noise_std: tuple[float, ...] = (0.0,)
-    quick_robots: tuple[int | None, ...] = (2,)
+    quick_robots: tuple[int | None, ...] = (2,)  #: Team sizes of the quick version
+    #: Numbers of nodes that every policy is run with; none leaves it to their other settings
     nodes: tuple[int, ...] = ()
 
     def studies(self, seeds: int) -> list[Study]:
@@ -84,39 +79,23 @@ class Section(Study):
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A figure or table of the paper.
+    """A figure or table of the paper."""
 
-    Attributes:
-        name: Its name on the command line.
-        title: Its title.
-        source: Section of the paper that has it.
-        sections: Its panels.
-        across: Attribute that varies from left to right.
-        metrics: Metrics in the tables, see :data:`~examples.studies.paper.numbers.METRICS`.
-        plots: Plots, see :data:`~examples.studies.paper.plots.PLOTS`.
-        seeds: Trials per policy, problem and level of noise; the paper's number.
-        deadlines: Seconds for planning, for tables of success within them.
-        paper: The numbers that the paper gives.
-        reference: Label of the policy that the others are compared with, trial by trial; ``None`` for no comparison.
-        compared_by: Cost in that, beside success.
-        timed: Whether seconds of planning are told at all.
-        remarks: Differences from the paper's set-up, one sentence or two each.
-    """
-
-    name: str
-    title: str
-    source: str
-    sections: tuple[Section, ...]
-    across: Across
-    metrics: tuple[str, ...]
-    plots: tuple[str, ...]
-    seeds: int = 50
-    deadlines: tuple[float, ...] = ()
-    paper: PaperNumbers = field(default_factory=dict)
+    name: str  #: Its name on the command line
+    title: str  #: Its title
+    source: str  #: Section of the paper that has it
+    sections: tuple[Section, ...]  #: Its panels
+    across: Across  #: Attribute that varies from left to right
+    metrics: tuple[str, ...]  #: Metrics in the tables, see :data:`~examples.studies.paper.numbers.METRICS`
+    plots: tuple[str, ...]  #: Plots, see :data:`~examples.studies.paper.plots.PLOTS`
+    seeds: int = 50  #: Trials per policy, problem and level of noise; the paper's number
+    deadlines: tuple[float, ...] = ()  #: Seconds for planning, for tables of success within them
+    paper: PaperNumbers = field(default_factory=dict)  #: The numbers that the paper gives
+    #: Label of the policy that the others are compared with, trial by trial; ``None`` for no comparison
     reference: str | None = None
-    compared_by: Cost = "runtime"
-    timed: bool = True
-    remarks: tuple[str, ...] = ()
+    compared_by: Cost = "runtime"  #: Cost in that, beside success
+    timed: bool = True  #: Whether seconds of planning are told at all
+    remarks: tuple[str, ...] = ()  #: Differences from the paper's set-up, one sentence or two each
 
     def quick(self) -> Figure:
         """The version that takes seconds and shows that everything works."""
