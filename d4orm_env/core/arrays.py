@@ -117,17 +117,21 @@ def frozen_per_robot(value: ArrayLike, name: str, num_robots: int, *, zero_allow
 
     Others are a ValueError that names the robot.
     """
-    numbers = numbers_of(value, f"{name} must be an array of numbers")
-    if numbers.ndim == 0:
-        numbers = np.repeat(numbers, num_robots)
-    elif numbers.shape != (num_robots,):
-        raise ValueError(f"{name} has shape {numbers.shape}; expected one number, or ({num_robots},)")
-    array = frozen_array(numbers, name, (num_robots,))
+    array = frozen_array(one_or_each(value, name, num_robots), name, (num_robots,))
     least = 0.0 if zero_allowed else SMALLEST
     if not zero_allowed:
         refuse_robots(array <= 0, name, array, "positive")
     refuse_robots((array < np.float32(least)) | (array > LARGEST), name, array, f"from {least:g} to {LARGEST:g}")
     return array
+
+
+def one_or_each(value: ArrayLike, name: str, num_robots: int, note: str = "") -> FloatArray:
+    """``(num_robots,)`` numbers, given as one for all robots or one each."""
+    numbers = numbers_of(value, f"{name} must be a number or one per robot")
+    numbers = np.repeat(numbers, num_robots) if numbers.ndim == 0 else numbers
+    if numbers.shape != (num_robots,):
+        raise ValueError(f"{name} has shape {numbers.shape}; expected one number, or ({num_robots},){note}")
+    return numbers
 
 
 def refuse_robots(wrong: BoolArray, name: str, values: FloatArray, wanted: str, unit: str = "") -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, FloatArray, frozen_per_robot, numbers_of, refuse_robots
+from d4orm_env.core.arrays import LARGEST, FloatArray, frozen_per_robot, numbers_of, one_or_each, refuse_robots
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.robot_model import ACCELERATION
 
@@ -33,7 +33,7 @@ def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
                 # Its acceleration must end too, at the rate that its controls allow.
                 speeds[robot] = min(speeds[robot], team.limits[robot, model.control_limits[0]] * step * step / 2)
         return speeds
-    speeds = _one_or_each(given, "goal_speed", team.num_robots)
+    speeds = one_or_each(given, "goal_speed", team.num_robots)
     right = (speeds >= 0) & ((speeds <= LARGEST) | (speeds == np.inf))
     refuse_robots(~right, "goal_speed", speeds, f"from 0 to {LARGEST:g}, or inf for no limit")
     return speeds
@@ -52,18 +52,9 @@ def checked_goal_poses(
     return {"goal_heading": headings, "goal_heading_tolerance": tolerances, "goal_hitches": angles}
 
 
-def _one_or_each(given: ArrayLike, name: str, num_robots: int, note: str = "") -> FloatArray:
-    """``(K,)`` numbers, given as one for all robots or one each."""
-    values = numbers_of(given, f"{name} must be a number or one per robot")
-    values = np.repeat(values, num_robots) if values.ndim == 0 else values
-    if values.shape != (num_robots,):
-        raise ValueError(f"{name} has shape {values.shape}; expected one number, or ({num_robots},){note}")
-    return values
-
-
 def _goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
     """``(K,)`` headings with which robots must arrive [rad], NaN for any."""
-    headings = _one_or_each(np.nan if given is None else given, "goal_heading", team.num_robots, ", NaN for any")
+    headings = one_or_each(np.nan if given is None else given, "goal_heading", team.num_robots, ", NaN for any")
     for robot in np.flatnonzero(~np.isnan(headings)).tolist():
         where = f"goal_heading of robot_{robot} is {headings[robot]:g}"
         if team.robot_models[robot].heading_index is None:

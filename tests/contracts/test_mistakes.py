@@ -133,7 +133,7 @@ PROBLEM = make_problem("circle", num_robots=2)
         (lambda: verify(PROBLEM, np.zeros((7, 2, 2))), r"problem.replace\(horizon=7\)"),
         (
             lambda: make_problem("circle", radius=[[0.1], [0.1, 0.2]]),
-            r"radius must be an array of numbers, not \[\[0.1\]",
+            r"radius must be a number or one per robot, not \[\[0.1\]",
         ),
         (
             lambda: run_episode(navigation_v0.parallel_env(problem=PROBLEM), lambda seen: seen),

@@ -55,7 +55,7 @@ def spatial(**changes: Any) -> Problem:
         ({"radius": [0.1, -0.5]}, "radius of robot_1 is -0.5; it must be positive"),
         ({"radius": [0.1, NAN]}, r"radius\[1\] is nan; every value must be finite"),
         ({"radius": [0.1, 0.1, 0.1]}, r"radius has shape \(3,\); expected one number, or \(2,\)"),
-        ({"radius": "wide"}, "radius must be an array of numbers"),
+        ({"radius": "wide"}, "radius must be a number or one per robot"),
         ({"max_speed": [1, 0]}, "max_speed of robot_1 is 0; it must be positive"),
         ({"max_speed": INF}, r"max_speed\[0\] is inf; every value must be finite"),
         ({"max_acceleration": -1}, "max_acceleration of robot_0 is -1; it must be positive"),
@@ -63,7 +63,7 @@ def spatial(**changes: Any) -> Problem:
         ({"max_turn_rate": 1e39}, r"max_turn_rate\[0\] is inf; every value must be finite"),
         ({"max_acceleration": 1e30}, r"max_acceleration of robot_0 is 1e\+30; it must be from 1e-07 to 1e\+06"),
         ({"max_speed": [1, 1e-30]}, r"max_speed of robot_1 is 1e-30; it must be from 1e-07 to 1e\+06"),
-        ({"radius": 10**400}, "radius must be an array of numbers, .* whole number too large for a float"),
+        ({"radius": 10**400}, "radius must be a number or one per robot, .* whole number too large for a float"),
     ],
 )
 def test_bad_teams_are_refused(arguments: dict[str, Any], message: str) -> None:
