@@ -35,7 +35,6 @@ def run(policy_name: str, num_robots: int, noise: float, seed: int) -> tuple[int
 
 
 def main() -> None:
-    """Print how both policies do as the noise grows."""
     parser = argument_parser(__doc__)
     parser.add_argument("--num-robots", "--robots", type=int, default=8)
     arguments = parser.parse_args()

@@ -52,7 +52,6 @@ class Successes(Callback):
         self.counts: list[tuple[int, int]] = []
 
     def on_batch_collected(self, batch: Any) -> None:
-        """Count."""
         ended = batch["next", "done"][..., 0]
         success = batch["next", "robots", "info", "success"][ended][:, 0, 0]
         self.counts.append((len(success), int(success.sum())))
@@ -72,7 +71,6 @@ def as_policy(module: Any, num_robots: int) -> SharedPolicy:
 
 
 def main() -> None:
-    """Train, and print how many episodes succeeded on the way."""
     arguments = recipe_arguments(__doc__, "--iterations", 80, "of 8192 steps of teams each")
     iterations, parts = (60, 3) if arguments.quick else (arguments.iterations, 10)
     torch.set_num_threads(1)  # the layers are too small to be shared

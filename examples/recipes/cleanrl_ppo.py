@@ -100,7 +100,6 @@ class Robots:
 
 
 def collect(robots: Robots, agent: Agent) -> tuple[Batch, list[bool]]:
-    """Act for some steps."""
     moments, successes = [], []
     for _ in range(HORIZON):
         seen = robots.seen
@@ -144,7 +143,6 @@ def update(agent: Agent, optimizer: Any, batch: Batch, advantage: Any) -> None:
 
 
 def main() -> None:
-    """Train, and print how many episodes succeeded on the way."""
     arguments = recipe_arguments(__doc__, "--updates", 100, "of 8192 steps of teams each")
     updates, parts = (42, 7) if arguments.quick else (arguments.updates, 10)
     torch.manual_seed(0)

@@ -45,7 +45,6 @@ def replace_start(problem: Problem, start: Any) -> Problem:
 
 
 def main() -> None:
-    """Ascend, and print the reward on the way."""
     parser = argument_parser(__doc__)
     arguments = parser.parse_args()
     num_worlds, num_updates = (8, 3) if arguments.quick else (256, 20)

@@ -148,7 +148,6 @@ def train(env: FunctionalEnv, num_updates: int, key: Any) -> tuple[Any, Any]:
 
 
 def main() -> None:
-    """Train, and print how many episodes succeeded on the way."""
     arguments = recipe_arguments(__doc__, "--updates", 100, "of 8192 steps of teams each")
     num_updates, rows = (42, 7) if arguments.quick else (arguments.updates, 10)
     env = FunctionalEnv("random", num_robots=arguments.num_robots, num_instances=512, **WORLD)

@@ -31,7 +31,6 @@ class Successes(RLlibCallback):
     """Tells whether all have arrived without contact."""
 
     def on_episode_end(self, *, episode: Any, metrics_logger: Any, **others: Any) -> None:
-        """Count."""
         last = [robot.get_infos(-1)["is_success"] for robot in episode.agent_episodes.values()]
         metrics_logger.log_value("success", float(any(last)), reduce="mean")
 
@@ -51,7 +50,6 @@ def settings(env_config: dict[str, Any], iterations: int) -> PPOConfig:
 
 
 def main() -> None:
-    """Train, print how many episodes succeeded on the way, and drive with what was learned."""
     arguments = recipe_arguments(__doc__, "--iterations", 120, "of 2048 steps of teams each")
     iterations, parts = (45, 3) if arguments.quick else (arguments.iterations, 10)
     world = {"scenario": "random", "num_robots": arguments.num_robots, **WORLD}

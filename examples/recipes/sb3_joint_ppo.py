@@ -20,7 +20,6 @@ from d4orm_planners.base.adapters import from_sb3
 
 
 def main() -> None:
-    """Train, and drive with what was learned."""
     arguments = recipe_arguments(__doc__, "--steps", 500_000, "steps of teams to train")
     torch.set_num_threads(1)  # the layers are too small to be shared
     register_environments()

@@ -43,7 +43,6 @@ def train(num_robots: int, worlds: int, steps: int, path: Path) -> PPO:
 
 
 def main() -> None:
-    """Train, and drive with what was learned."""
     arguments = recipe_arguments(__doc__, "--steps", 500_000, "robot-steps to train")
     torch.set_num_threads(1)  # the layers are too small to be shared
     path = arguments.out / "supersuit_ppo.zip"

@@ -88,7 +88,6 @@ def with_advantages(data: Any, advantages: GAE) -> Any:
 
 
 def main() -> None:
-    """Train, and print how many episodes succeeded on the way."""
     arguments = recipe_arguments(__doc__, "--updates", 100, "of 8192 steps of teams each")
     updates, parts = (42, 7) if arguments.quick else (arguments.updates, 10)
     torch.manual_seed(0)

@@ -76,7 +76,6 @@ def fly(flight: dict[str, list[list[float]]]) -> None:
 
 
 def main() -> None:
-    """Read the flight and fly it."""
     if len(sys.argv) < 3:
         raise SystemExit("give a folder of d4orm export, and a URI for each of its robots")
     folder, uris = Path(sys.argv[1]), sys.argv[2:]

@@ -77,7 +77,6 @@ def make_all() -> None:
 
 
 def main() -> None:
-    """List the studies, run one, or make everything."""
     name, *arguments = sys.argv[1:] or ["--help"]
     if name == "all":
         with patch.object(sys, "argv", ["python -m examples.studies all", *arguments]):

@@ -39,7 +39,6 @@ FEW = 2
 
 
 def row_of(label: str, problem: Problem, seed: int, planner: Any) -> Row:
-    """One solve."""
     began = process_time()
     plan = planner.solve(problem, seed=seed)
     spent = process_time() - began
@@ -86,7 +85,6 @@ def summary(rows: Sequence[Row]) -> list[Row]:
 
 
 def main() -> None:
-    """Run every team, seed and planner, and write the table."""
     arguments = study_parser(__doc__, seeds=10).parse_args()
     teams, seeds = (TEAMS, arguments.seeds) if not arguments.quick else ((("paper_circle", 2),), 1)
     rows = study_rows(arguments, "against_mmd", lambda: measure(teams, seeds))

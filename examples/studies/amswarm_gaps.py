@@ -61,7 +61,6 @@ def median_steps(trials: Sequence[Trial]) -> str:
 
 
 def main() -> None:
-    """Run every variant, and write the table."""
     arguments = trials_parser(__doc__, seeds=10).parse_args()
     settings, seeds = (TINY, 1) if arguments.quick else (PAPER, arguments.seeds)
     variants = problems()

@@ -71,7 +71,6 @@ def summary(rows: Rows) -> Rows:
 
 
 def main() -> None:
-    """Run every team and seed, and write the table."""
     arguments = study_parser(__doc__, seeds=10).parse_args()
     teams, seeds, solved = TEAMS, arguments.seeds, partial(solve, max_iterations=MAX_ITERATIONS)
     if arguments.quick:

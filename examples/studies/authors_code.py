@@ -132,7 +132,6 @@ def summary(rows: list[Row]) -> list[Row]:
 
 
 def main() -> None:
-    """Run their code and ours, and write the table."""
     parser = study_parser(__doc__, seeds=20)
     parser.add_argument("--checkout", type=folder, help="of proroklab/d4orm; needed without --trials")
     arguments = parser.parse_args()

@@ -118,7 +118,6 @@ def draw(teams: dict[str, Cells], path: Path) -> None:
 
 
 def main() -> None:
-    """Run every cell on every team, write the table and draw the curves."""
     arguments = trials_parser(__doc__, seeds=50).parse_args()
     size = (TEAMS[:1], 1, TINY) if arguments.quick else (TEAMS, arguments.seeds, BUDGET)
     found = by_team(study_trials(arguments, "credit_by_update", studies(*size)))

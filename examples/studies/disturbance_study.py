@@ -93,7 +93,6 @@ def name_of(trial: Trial) -> str:
 
 
 def by_cell(trials: Iterable[Trial]) -> Cells:
-    """The table's cells."""
     named = names_by_text()
     cells: Cells = {}
     bodies = {model: name for name, model in BODIES.items()}
@@ -168,7 +167,6 @@ def draw(cells: Cells, path: Path) -> None:
 
 
 def main() -> None:
-    """Run the study, write the table and draw the heat map."""
     parser = trials_parser(__doc__, seeds=50)
     parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=SCENARIOS)
     arguments = parser.parse_args()

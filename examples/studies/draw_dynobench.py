@@ -230,7 +230,6 @@ def _rounded(values: Any) -> list[float]:
 
 
 def main() -> None:
-    """Write the files."""
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=5, help="of every kind")
     arguments = parser.parse_args()

@@ -72,7 +72,6 @@ def row_of(benchmark: str, path: Path, seed: int, load: Callable[[Path], Problem
 
 
 def main() -> None:
-    """Plan all instances of dynobench and write the table."""
     parser = study_parser(__doc__, seeds=5)
     parser.add_argument("--checkouts", type=Path, nargs="+", default=(), help="checkouts with instances in example/")
     arguments = parser.parse_args()

@@ -62,7 +62,6 @@ class Watched(GroupWeights):
         self.first: dict[str, float] = {}
 
     def __call__(self, rewards: Any, xp: Any, log_ratio: Any = None) -> Any:
-        """See :class:`GroupWeights`."""
         weights = super().__call__(rewards, xp, log_ratio)
         if not self.first:
             own, weight = np.asarray(rewards, np.float64), np.asarray(weights, np.float64)
@@ -180,7 +179,6 @@ def draw(rows: Rows, out: Any) -> None:
 
 
 def main() -> None:
-    """Run every team size, credit and seed, and write the table and the plot."""
     arguments = study_parser(__doc__, seeds=20).parse_args()
     settings: tuple[Any, ...] = (SIZES, arguments.seeds, NUM_SAMPLES, NUM_STEPS)
     if arguments.quick:

@@ -93,7 +93,6 @@ def _point(way: str, point: Rows) -> dict[str, object]:
 
 
 def main() -> None:
-    """Learn, or read curves, and write what came of it."""
     arguments = study_parser(__doc__, seeds=3).parse_args()
     seeds, quick, out = (1 if arguments.quick else arguments.seeds), arguments.quick, arguments.out / "imitation"
     rows = study_rows(arguments, "imitate_expert", lambda: measure(seeds, out, quick))

@@ -72,7 +72,6 @@ def summary(rows: Rows) -> Rows:
 
 
 def main() -> None:
-    """Run every team, noise and seed, and write the table."""
     arguments = study_parser(__doc__, seeds=20).parse_args()
     measured = partial(measure, TEAMS, arguments.seeds)
     if arguments.quick:

@@ -111,7 +111,6 @@ def summary(drives: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run the loop, print the throughput and write the table and the animation of the first seed."""
     parser = study_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=1.0, help="simulated time per seed")
     parser.add_argument("--scenario", default="random")

@@ -223,7 +223,6 @@ def save_prior(prior: Prior, path: Path) -> None:
 
 
 def main() -> None:
-    """Draw examples, train and write the weights."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--examples", type=int, default=3772, help="two per plan")
     parser.add_argument("--steps", type=int, default=6000, help="minibatches")

@@ -251,7 +251,6 @@ def draw_teams(rows: Sequence[Row], out: Any) -> None:
 
 
 def main() -> None:
-    """Solve with every planner and seed, count the classes, write the table and the plot."""
     parser = study_parser(__doc__, seeds=100)
     parser.add_argument("--radius", type=float, default=0.5, help="of the obstacle [m]")
     parser.add_argument("--team", type=count, metavar="ROBOTS", help="so many on a circle instead, and no obstacle")

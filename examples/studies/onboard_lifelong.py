@@ -52,7 +52,6 @@ def kill_order(text: str) -> tuple[int, float]:
 
 
 def main() -> int:
-    """Start the robots, run the world, write tables, timeline and animation."""
     parser = argument_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=2.0, help="simulated time")
     parser.add_argument("--num-robots", "--robots", type=count, default=6)

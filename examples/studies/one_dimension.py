@@ -93,7 +93,6 @@ def draw(runs: dict[str, Run], scales: dict[str, np.ndarray], best: float, out: 
 
 
 def main() -> None:
-    """Compare over many seeds, write the table, and draw one seed."""
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=200)
     parser.add_argument("--steps", type=count, default=50)

@@ -39,7 +39,6 @@ class Case(NamedTuple):
 
 
 def noisy(name: str, scenario: str, num_robots: int) -> Case:
-    """A case under noise."""
     return Case(f"{name}, noise", scenario, num_robots, NOISE)
 
 
@@ -126,7 +125,6 @@ def table_of(rows: Rows, table: str) -> list[dict[str, str]]:
 
 
 def main() -> None:
-    """Roll out every policy in every case, and write a table for open ground and one for walls."""
     parser = study_parser(__doc__, seeds=100)
     parser.add_argument("--file", choices=FILES, nargs="+", default=list(FILES), help="only these policy files")
     arguments = parser.parse_args()

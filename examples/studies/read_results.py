@@ -69,7 +69,6 @@ def draw(folder: Path, out: Path) -> None:
 
 
 def main() -> None:
-    """Evaluate if there is nothing to read, then read, sum up and draw."""
     parser = argument_parser(__doc__)
     parser.add_argument("--results", type=Path, help="folder that `d4orm evaluate` wrote to")
     parser.add_argument("--format", choices=("parquet", "csv", "sqlite"), default="parquet")

@@ -62,7 +62,6 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Plan for every team size, and write the table and the plot."""
     parser = study_parser(__doc__)
     parser.add_argument("--num-robots", "--robots", type=count, nargs="+", default=ROBOTS)
     parser.add_argument("--seeds", type=count, default=3, help="problems per team size")

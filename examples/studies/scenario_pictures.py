@@ -34,7 +34,6 @@ SCENARIOS: dict[str, dict[str, Any]] = {
 
 
 def main() -> None:
-    """One picture per scenario, with all robots at the start."""
     parser = argument_parser(__doc__)
     parser.add_argument("--num-robots", "--robots", type=count, default=8)
     parser.add_argument("--seed", type=int, default=0)

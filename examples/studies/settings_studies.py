@@ -389,7 +389,6 @@ COMPARISONS: Mapping[str, Comparison] = {
 
 
 def main(name: str) -> None:
-    """Run a comparison, and write its table."""
     compared = COMPARISONS[name]
     arguments = trials_parser(f"{compared.about}\n\n{__doc__}", seeds=50).parse_args()
     blocks = compared.blocks_of(arguments.quick)

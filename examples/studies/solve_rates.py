@@ -196,7 +196,6 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Plan, and write a table per set of cases, and that of the README."""
     parser = study_parser(__doc__, seeds=20)
     parser.add_argument("--sets", nargs="+", choices=SETS, default=[*SETS], help="tables to make")
     parser.add_argument("--planner", nargs="+", help="who plans, in place of those of the tables")

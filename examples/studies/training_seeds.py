@@ -122,7 +122,6 @@ def draw(rows: Rows, path: Path) -> None:
 
 
 def main() -> None:
-    """Train, or read curves; write the curves, a table of their ends and the picture."""
     arguments = study_parser(__doc__, seeds=3).parse_args()
     trainings = partial(measure, arguments.seeds, arguments.out, arguments.quick)
     rows = study_rows(arguments, "training_seeds", trainings)

@@ -89,7 +89,6 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, object]]:
 
 
 def main() -> None:
-    """Tune both, or one, and write what was tried."""
     parser = study_parser(__doc__)
     parser.add_argument("--candidates", type=count, default=7, help="settings tried per learner, its own included")
     parser.add_argument("--learner", action="append", choices=TRAININGS, help="only this one; repeatable")

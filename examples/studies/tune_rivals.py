@@ -153,7 +153,6 @@ def shortlist(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Tune all methods, or some, and write what was tried."""
     parser = study_parser(__doc__)
     parser.add_argument("--candidates", type=count, default=27, help="settings tried per method, the preset included")
     parser.add_argument("--seeds", type=count, default=4, help="seeds of the first round")

@@ -88,7 +88,6 @@ def summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Plan and drive, and write the table."""
     arguments = study_parser(__doc__, seeds=20).parse_args()
     chosen: tuple[Any, ...] = PLANNERS, CASES, arguments.seeds
     if arguments.quick:

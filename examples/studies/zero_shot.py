@@ -50,7 +50,6 @@ def figure(seed: int) -> Problem:
 
 
 def problem_of(scenario: str, seed: int) -> Problem:
-    """The team's problem."""
     common: dict[str, Any] = {"robot": ROBOT, "height": 1.0, "horizon": HORIZON}
     if scenario == "figure of ten":
         return figure(seed)
@@ -143,7 +142,6 @@ def row_of(scenario: str, condition: str, rows: Sequence[dict[str, Any]]) -> dic
 
 
 def main() -> None:
-    """Fly all teams and write the table."""
     arguments = study_parser(__doc__, seeds=20).parse_args()
     if arguments.trials is None:
         require("drones", "crazyflow")

@@ -114,7 +114,6 @@ Message = TypeVar("Message", Tick, Command)
 
 
 def encode(message: Tick | Command) -> bytes:
-    """A message as bytes."""
     return json.dumps(asdict(message)).encode()
 
 

@@ -59,7 +59,6 @@ def authors_of(rows: Sequence[Row]) -> dict[str, int]:
 
 
 def run_row(record: Record, rows: Sequence[Row], dt: float) -> Row:
-    """The run in figures."""
     by_event = {event: [row for row in rows if row["event"] == event] for event in {row["event"] for row in rows}}
     computing = 1000 * np.array([row["until"] - row["time"] for row in by_event.get("computed", [])])
     sent = by_event.get("sent", [])
@@ -87,7 +86,6 @@ def run_row(record: Record, rows: Sequence[Row], dt: float) -> Row:
 
 
 def robot_rows(record: Record, rows: Sequence[Row]) -> list[Row]:
-    """Each robot in figures."""
     made = authors_of(rows)
     taken = {row["plan"] for row in rows if row["event"] == "takes over"}
     table = []

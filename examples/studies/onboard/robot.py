@@ -62,7 +62,6 @@ class Robot:
         return Command(tick.number, self._number, [float(u) for u in control], ballot, reward, self._course.digest)
 
     def end(self) -> None:
-        """Stop planning."""
         if self._round is not None:
             self._round.end(self._mission.timeout)
 
@@ -154,7 +153,6 @@ def drive(mission: Mission, number: int, robot: Robot, world: Transport) -> None
 
 
 def main() -> None:
-    """Run one robot."""
     path, number, log_path = sys.argv[1:]
     mission, own = Mission(**json.loads(Path(path).read_text())), int(number)
     # Ctrl-C is for the one that started the robots, and the world tells them when it is over.

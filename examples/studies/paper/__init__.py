@@ -38,7 +38,6 @@ def measure(figure: Figure, arguments: Namespace) -> None:
 
 
 def main(given: Sequence[str] | None = None) -> int:
-    """List the figures, or measure one."""
     parser = trials_parser(__doc__)
     parser.add_argument("figure", nargs="?", choices=FIGURES, metavar="FIGURE", help="without it, what there is")
     parser.add_argument("--seeds", "-n", type=count, help="trials per row, by default 50, and 1 with --quick")

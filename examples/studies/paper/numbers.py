@@ -72,7 +72,6 @@ def first_solution(trial: Trial) -> float | None:
 
 
 def measured(group: Group) -> Measured:
-    """Sum a group up."""
     trials = group.trials
     times = [first_solution(trial) for trial in trials]
     solved = [(trial, seconds) for trial, seconds in zip(trials, times) if seconds is not None]

@@ -27,7 +27,6 @@ class CountedIpopt(ipopt.Ipopt):
     """IPOPT whose own iterations are told as denoising steps, those without collisions left out."""
 
     def iterate(self, search: SolveRun, state: ipopt.WarmStart) -> tuple[ipopt.WarmStart, Iteration]:
-        """See :meth:`Planner.iterate`."""
         stopper, solves, calls = ipopt._stopper, 0, 0
 
         def counted(sizes: dict[str, int], keep: Callable[[object], None], ends: Callable[[], bool]) -> object:
