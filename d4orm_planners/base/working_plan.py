@@ -77,10 +77,9 @@ class WorkingPlan:
     def move(self, robots: ArrayLike, controls: FloatArray, states: FloatArray, arrived: ArrayLike) -> None:
         """Give robots ``(R,)`` other controls ``(H, R, m)``, states ``(H+1, R, n)`` and arrivals ``(R,)``."""
         index = np.asarray(robots)
-        self.controls[:, index] = 0
-        self.controls[:, index, : controls.shape[2]] = controls
-        self.states[:, index] = 0
-        self.states[:, index, : states.shape[2]] = states
+        for rows, others in ((self.controls, controls), (self.states, states)):
+            rows[:, index, : others.shape[2]] = others
+            rows[:, index, others.shape[2] :] = 0
         self.arrived[index] = arrived
         self.reported[index] = self.problem.horizon + 1
         self.index.move(index, states[..., : self.problem.dimension])

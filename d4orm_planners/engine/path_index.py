@@ -46,7 +46,8 @@ class PathIndex:
         # Robots as near to each other as they may be are about one in a cell.
         scale = 1 / (2 * safety_distance)
         self.table = PathTable(
-            BLOCK, positions, radii, np.float64(margin), np.float64(safety_distance), np.float64(scale),
+            BLOCK, positions, np.zeros((num_blocks, num_robots, BLOCK, positions.shape[2]), np.float32), radii,
+            np.float64(margin), np.float64(safety_distance), np.float64(scale),
             np.zeros((num_blocks, num_robots, 3)), np.zeros((num_blocks, num_robots)),
             np.zeros(1), np.zeros(1, np.int64),
             np.full((num_blocks, 1 << (2 * num_robots - 1).bit_length()), NOBODY),

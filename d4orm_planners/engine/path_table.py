@@ -7,7 +7,7 @@ are in the few cells around it. Memory and time grow with the robots, not with t
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -27,6 +27,7 @@ class PathTable(NamedTuple):
 
     block: int  #: :data:`BLOCK`
     positions: FloatArray  #: ``(H+1, K, d)`` float32 [m]
+    blocks: FloatArray  #: ``(B, K, BLOCK, d)`` the same, those of a robot in a block side by side
     radius: Floats  #: ``(K,)`` float64 [m]
     margin: np.float64  #: ``()`` float64 [m]
     safety_distance: np.float64  #: ``()`` float64 the largest distance at which two robots are near [m]
@@ -85,7 +86,10 @@ def enclose(path: FloatArray, dimension: int, first: Whole, last: Whole) -> tupl
 @inlined
 def link(table: PathTable, block: Whole, robot: Whole) -> None:
     first, last = steps_of(table, block)
-    middle, spread = enclose(table.positions[:, robot], table.positions.shape[2], first, last)
+    for t in range(first, last):
+        for axis in range(table.positions.shape[2]):
+            table.blocks[block, robot, t - first, axis] = table.positions[t, robot, axis]
+    middle, spread = enclose(table.blocks[block, robot], table.positions.shape[2], first - first, last - first)
     table.middle[block, robot, 0], table.middle[block, robot, 1], table.middle[block, robot, 2] = middle
     table.spread[block, robot] = spread
     table.widest[0] = max(table.widest[0], spread)
@@ -129,11 +133,19 @@ def first_near(
     far = _WIDER * (safety_distance + spread + table.spread[block, other])
     if x * x + y * y + z * z > far * far:
         return 0
+    return _first_step(table, safety_distance, path, begin, block, other)
+
+
+@inlined
+def _first_step(
+    table: PathTable, safety_distance: float, path: FloatArray, begin: Whole, block: Whole, other: Whole
+) -> int:
+    """See :func:`first_near`."""
     first, last = steps_of(table, block)
     for t in range(first, last):
         gap2 = 0.0
-        for axis in range(table.positions.shape[2]):
-            gap = np.float64(path[t - begin, axis]) - np.float64(table.positions[t, other, axis])
+        for axis in range(table.blocks.shape[3]):
+            gap = np.float64(path[t - begin, axis]) - np.float64(table.blocks[block, other, t - first, axis])
             gap2 += gap * gap
         if gap2 <= safety_distance * safety_distance:
             return t
@@ -180,4 +192,88 @@ def count_near(table: PathTable, robot: Whole, exclude: IntArray, path: FloatArr
                     if not _is_among(other, exclude):
                         count += first_near(table, robot, path, begin, middle, spread, block, other) > 0
                     other = table.following[block, other]
+    return count
+
+
+Box: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Lowest and highest corner [m]."""
+
+
+class Nearby(NamedTuple):
+    """Robots that may be near to paths in a box in a block, found once for all of these paths."""
+
+    robots: IntArray  #: ``(K + 1,)`` their numbers
+    buckets: IntArray  #: ``(K,)`` and buckets
+    middle: Floats  #: ``(K, 3)`` float64 where each is, more or less [m],
+    reach: Floats  #: ``(K,)`` float64 and how near to there a path meets it, from a point as large as nothing [m]
+    found: IntArray  #: ``(1,)`` how many there are
+
+
+def make_nearby(num_robots: int) -> Nearby:
+    """Room for so many."""
+    return Nearby(
+        np.empty(num_robots + 1, np.int64),
+        np.empty(num_robots, np.int64),
+        np.empty((num_robots, 3)),
+        np.empty(num_robots),
+        np.zeros(1, np.int64),
+    )
+
+
+@compiled
+def find_nearby(table: PathTable, robot: Whole, exclude: IntArray, box: Box, block: Whole, nearby: Nearby) -> None:
+    """Find those that a robot may meet in a box in a block, but for those in ``exclude`` ``(N,)``."""
+    (low_x, low_y, low_z), (high_x, high_y, high_z) = box
+    own, count = table.radius[robot] + table.margin, np.int64(0)
+    # All in a row: that takes less time than a few buckets.
+    for other in range(table.middle.shape[1]):
+        x, y, z = table.middle[block, other]
+        far = _WIDER * (own + table.radius[other] + table.spread[block, other])
+        nearby.robots[count] = other
+        count += (
+            (x >= low_x - far)
+            & (x <= high_x + far)
+            & (y >= low_y - far)
+            & (y <= high_y + far)
+            & (z >= low_z - far)
+            & (z <= high_z + far)
+        )
+    nearby.found[0] = 0
+    for number in range(count):
+        other = nearby.robots[number]
+        if not _is_among(other, exclude):
+            kept = nearby.found[0]
+            nearby.robots[kept], nearby.buckets[kept] = other, _own_bucket(table, block, other)
+            nearby.reach[kept] = own + table.radius[other] + table.spread[block, other]
+            for axis in range(3):
+                nearby.middle[kept, axis] = table.middle[block, other, axis]
+            nearby.found[0] = kept + 1
+
+
+@compiled
+def count_among(table: PathTable, robot: Whole, nearby: Nearby, path: FloatArray, block: Whole) -> int:
+    """See :func:`count_near`, of a path in the box in which some are :class:`Nearby`."""
+    first, last = steps_of(table, block)
+    middle, spread = enclose(path, table.positions.shape[2], first - first, last - first)
+    count = 0
+    for number in range(nearby.found[0]):
+        x, y, z = nearby.middle[number]
+        x, y, z, far = x - middle[0], y - middle[1], z - middle[2], _WIDER * (nearby.reach[number] + spread)
+        if x * x + y * y + z * z <= far * far:
+            other = nearby.robots[number]
+            safety_distance = table.radius[robot] + table.radius[other] + table.margin
+            if _first_step(table, safety_distance, path, first, block, other) > 0:
+                count += _times_looked_at(table, middle, spread, nearby.buckets[number])
+    return count
+
+
+@inlined
+def _times_looked_at(table: PathTable, middle: tuple[float, float, float], spread: float, bucket: Whole) -> int:
+    """Number of cells around a path that share a bucket: so often :func:`count_near` counts a robot in it."""
+    low_i, high_i, low_j, high_j, low_k, high_k = cells_around(table, middle, spread)
+    count = 0
+    for i in range(low_i, high_i + 1):
+        for j in range(low_j, high_j + 1):
+            for k in range(low_k, high_k + 1):
+                count += bucket_of(table, i, j, k) == bucket
     return count

@@ -10,7 +10,16 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine.compiling import compiled
-from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
+from d4orm_env.engine.simd import TILE
+from d4orm_planners.engine.path_table import (
+    BLOCK,
+    Nearby,
+    PathTable,
+    count_among,
+    count_near,
+    make_nearby,
+    steps_of,
+)
 
 
 class BeamRules(NamedTuple):
@@ -41,22 +50,34 @@ class Queries(NamedTuple):
 
 
 class Beam(NamedTuple):
-    """Up to ``N`` paths as far as they have come."""
+    """Up to ``N`` paths as far as they have come, and room for one more."""
 
-    states: FloatArray  #: ``(N, n)``
-    velocities: FloatArray  #: ``(N, d)``
-    faults: Floats  #: ``(N,)`` robots met, block by block
-    costs: Floats  #: ``(N,)`` what they cost at least, as it seems, but for that [s]
+    states: FloatArray  #: ``(N + 1, n)``
+    motions: FloatArray  #: ``(N + 1, 2d)`` positions and velocities
+    faults: Floats  #: ``(N + 1,)`` robots met, block by block
+    numbers: IntArray  #: ``(N + 1,)`` their numbers among all ever kept
+
+
+class Branches(NamedTuple):
+    """Paths that go on from all in the beam by every move, ``N`` in whole tiles, path by path."""
+
+    lanes: FloatArray  #: ``(T, LANES)`` workspace of :mod:`~d4orm_planners.mapf.block_drives`
+    costs: Floats  #: ``(N,)`` what they cost at least, as it seems, but for robots met [s]
     bounds: Floats  #: ``(N,)`` what they cost at least, robots met so far included [s]
-    before: IntArray  #: ``(N,)`` number of the path that each goes on from: in the beam before, or ever
-    moves: IntArray  #: ``(N,)`` what was done in the last block
-    paths: FloatArray  #: ``(N, BLOCK, d)`` positions in it [m]
+    faults: Floats  #: ``(N,)`` robots met, block by block
+    #: ``(N, 2)`` bool, those of which it is known what they do wrong by themselves in the last block, and whom they
+    #: meet there
+    counted: BoolArray
+    apart: IntArray  #: ``(N,)`` how many of those kept none of them is like
+    heap: IntArray  #: ``(N,)`` numbers of those that may still be kept, the most promising first
+    path: FloatArray  #: ``(BLOCK, d)`` positions of one of them in the block [m]
+    nearby: Nearby  #: Robots that they may meet in it
 
 
 class PathTree(NamedTuple):
     """All paths ever kept."""
 
-    before: IntArray  #: ``(N,)`` what each goes on from ...
+    before: IntArray  #: ``(N,)`` number of what each goes on from ...
     moves: IntArray  #: ``(N,)`` ... and by what
     used: IntArray  #: ``(1,)`` how many there are
 
@@ -65,43 +86,44 @@ class BeamSpace(NamedTuple):
     """Workspace of a search."""
 
     beam: Beam  #: The paths kept after the last block
-    numbers: IntArray  #: ``(width,)`` their numbers among all ever kept
-    new: Beam  #: Those that go on from there, and room for one more
-    heap: IntArray  #: ``(N,)`` numbers of these that may still be kept, the most promising first
-    #: ``(N, 2)`` bool, those of which it is known what they do wrong by themselves in the last block, and whom they
-    #: meet there
-    counted: BoolArray
+    before: IntArray  #: ``(width,)`` numbers of those kept after the block before
+    new: Branches  #: Those that go on from there
     ever: PathTree  #: All ever kept
     did: IntArray  #: ``(B,)`` the moves of the path found, the last first
-    lanes: FloatArray  #: Workspace of :mod:`~d4orm_planners.mapf.motion_primitives`
 
 
-def _make_beam(size: int, n: int, d: int, steps: int) -> Beam:
-    return Beam(
-        np.empty((size, n), np.float32), np.empty((size, d), np.float32), np.empty(size), np.empty(size),
-        np.empty(size), np.empty(size, np.int64), np.empty(size, np.int64), np.empty((size, steps, d), np.float32),
-    )  # fmt: skip
-
-
-def make_beam_space(width: int, num_moves: int, num_blocks: int, n: int, d: int, lanes: int) -> BeamSpace:
-    """Workspace for a beam of so many paths, moves and blocks of steps, with so many numbers for block drives."""
+def make_beam_space(
+    width: int, num_moves: int, num_blocks: int, n: int, d: int, lanes: int, num_robots: int
+) -> BeamSpace:
+    """Workspace for a beam of so many paths, moves and blocks of steps, with so many numbers for a tile's drives."""
     before, moves = np.empty((2, width * num_blocks), np.int64)
-    most = width * num_moves
+    tiles = -(-width * num_moves // TILE)
+    most = tiles * TILE
     return BeamSpace(
-        _make_beam(width, n, d, 0), np.empty(width, np.int64), _make_beam(most + 1, n, d, BLOCK),
-        np.empty(most, np.int64), np.empty((most, 2), np.bool_), PathTree(before, moves, np.empty(1, np.int64)),
-        np.empty(num_blocks, np.int64), np.zeros(lanes, np.float32),
+        Beam(
+            np.empty((width + 1, n), np.float32), np.empty((width + 1, 2 * d), np.float32), np.empty(width + 1),
+            np.empty(width + 1, np.int64),
+        ),
+        np.empty(width, np.int64),
+        Branches(
+            np.zeros((tiles, lanes), np.float32), np.empty(most), np.empty(most), np.empty(most),
+            np.empty((most, 2), np.bool_), np.empty(most, np.int64), np.empty(most, np.int64),
+            np.empty((BLOCK, d), np.float32), make_nearby(num_robots),
+        ),
+        PathTree(before, moves, np.empty(1, np.int64)),
+        np.empty(num_blocks, np.int64),
     )  # fmt: skip
 
 
 @compiled
-def is_like_another(new: Beam, node: Whole, kept: Beam, size: Whole, dedup2: float) -> bool:
-    """Check whether a path is about where one of those kept is, and about as fast."""
-    for other in range(size):
+def is_like_another(kept: Beam, first: Whole, size: Whole, dedup2: float) -> bool:
+    """Check whether the path after those kept is about where one of these from some on is, and about as fast."""
+    d = kept.motions.shape[1] // 2
+    for other in range(first, size):
         gap2, change2 = 0.0, 0.0
-        for axis in range(new.velocities.shape[1]):
-            gap = new.states[node, axis] - kept.states[other, axis]
-            change = new.velocities[node, axis] - kept.velocities[other, axis]
+        for axis in range(d):
+            gap = kept.motions[size, axis] - kept.motions[other, axis]
+            change = kept.motions[size, d + axis] - kept.motions[other, d + axis]
             gap2 += gap * gap
             change2 += change * change
         if gap2 < dedup2 and change2 < 4 * dedup2:
@@ -110,14 +132,10 @@ def is_like_another(new: Beam, node: Whole, kept: Beam, size: Whole, dedup2: flo
 
 
 @compiled
-def keep(new: Beam, node: Whole, kept: Beam, size: Whole, numbers: IntArray, ever: PathTree) -> None:
-    """Keep a path as the next one of the beam, with its number among all ever kept, which ``numbers`` is told."""
-    for i in range(new.states.shape[1]):
-        kept.states[size, i] = new.states[node, i]
-    for axis in range(new.velocities.shape[1]):
-        kept.velocities[size, axis] = new.velocities[node, axis]
-    kept.faults[size], number = new.faults[node], ever.used[0]
-    ever.before[number], ever.moves[number], numbers[size] = new.before[node], new.moves[node], number
+def keep(kept: Beam, size: Whole, faults: float, before: Whole, move: Whole, ever: PathTree) -> None:
+    """Keep the path after so many of those kept, with its number among all ever kept."""
+    number = ever.used[0]
+    kept.faults[size], kept.numbers[size], ever.before[number], ever.moves[number] = faults, number, before, move
     ever.used[0] = number + 1
 
 
@@ -128,9 +146,9 @@ def sink(bounds: Floats, heap: IntArray, position: Whole, size: Whole) -> None:
     while 2 * position + 1 < size:
         child = 2 * position + 1
         if child + 1 < size:
+            # Without a branch, which nobody could predict.
             left, right = heap[child], heap[child + 1]
-            if bounds[right] < bounds[left] or (bounds[right] == bounds[left] and right < left):
-                child += 1
+            child += (bounds[right] < bounds[left]) | ((bounds[right] == bounds[left]) & (right < left))
         other = heap[child]
         if bounds[node] < bounds[other] or (bounds[node] == bounds[other] and node < other):
             break
@@ -168,16 +186,21 @@ def _count_extra(
 
 
 @compiled
-def count_met(table: PathTable, queries: Queries, r: int, path: FloatArray, block: Whole) -> int:
+def count_met(table: PathTable, queries: Queries, r: int, nearby: Nearby, path: FloatArray, block: Whole) -> int:
     """Count the robots that a path meets in a block."""
     robot, (first, last) = queries.robots[r], steps_of(table, block)
-    count = count_near(table, robot, queries.others.exclude[r], path, first, block)
+    count = count_among(table, robot, nearby, path, block)
     return count + _count_extra(table, robot, queries.others, r, path, first, last)
 
 
 @compiled
-def count_passing(table: PathTable, queries: Queries, r: int, path: FloatArray, block: Whole) -> int:
-    """Count the robots that come by after a block that ended at the goal, where this one stays; ``path`` is changed."""
+def count_passing(
+    table: PathTable, queries: Queries, r: int, path: FloatArray, block: Whole, contact: float, left: float
+) -> int:
+    """Count the robots that come by after a block that ended at the goal, where this one stays; ``path`` is changed.
+
+    When those counted cost more than is ``left``, at so much ``contact`` each, the rest does not matter.
+    """
     robot, others, (first, last) = queries.robots[r], queries.others, steps_of(table, block)
     for row in range(path.shape[0]):
         for axis in range(path.shape[1]):
@@ -185,5 +208,7 @@ def count_passing(table: PathTable, queries: Queries, r: int, path: FloatArray, 
     # In the block after the last in which anybody moves all are where they stay.
     count, last_busy = 0, min(table.first.shape[0] - 1, table.moving[0] + 1)
     for later in range(block + 1, last_busy + 1):
+        if contact * (count - 1) > left:
+            return count
         count += count_near(table, robot, others.exclude[r], path, steps_of(table, later)[0], later)
     return count + _count_extra(table, robot, others, r, path, last, len(table.positions))

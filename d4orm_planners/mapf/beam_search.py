@@ -25,9 +25,8 @@ from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.stepping import Row, models_key
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.engine.path_table import BLOCK, PathTable, steps_of
+from d4orm_planners.engine.path_table import BLOCK, PathTable, find_nearby, steps_of
 from d4orm_planners.mapf.beam import (
-    Beam,
     BeamRules,
     BeamSpace,
     OtherAgents,
@@ -40,18 +39,17 @@ from d4orm_planners.mapf.beam import (
     sink,
     trace_back,
 )
-from d4orm_planners.mapf.motion_primitives import (
+from d4orm_planners.mapf.block_drives import (
     LANES,
-    MotionPrimitives,
-    Moves,
-    aiming,
     block_driver,
     count_faults,
+    enclose_lanes,
     end_of,
-    frame_at,
-    path_reader,
+    has_arrived,
     read_positions,
+    read_state,
 )
+from d4orm_planners.mapf.motion_primitives import MotionPrimitives, Moves, aiming, frame_at
 from d4orm_planners.tracking.steering import Rollouts, by_model
 from d4orm_planners.tracking.tracker import tracker
 
@@ -61,7 +59,7 @@ Ending: TypeAlias = tuple[float, Whole, Whole]
 
 @inlined
 def _keep_best(
-    arrays: ProblemArrays, table: PathTable, rules: BeamRules, queries: Queries, r: int,
+    arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, queries: Queries, r: int,
     space: BeamSpace, count: Whole, block: Whole, best: float,
 ) -> Whole:  # fmt: skip
     """Keep the most promising of ``count`` paths, of those that are alike the better one; return how many.
@@ -69,29 +67,34 @@ def _keep_best(
     Most are worse than those kept whatever they touch or meet. So that is counted of one only when its turn comes,
     which then comes again.
     """
-    new, heap, counted, numbers = space.new, space.heap, space.counted, space.numbers
-    robot, (begin, end) = queries.robots[r], steps_of(table, block)
+    beam, new, heap = space.beam, space.new, space.new.heap
+    robot, (begin, end), num_moves = queries.robots[r], steps_of(table, block), moves.pace.shape[0]
     dedup2 = rules.dedup_distance * rules.dedup_distance
     root = size = np.int64(0)  # literals would compile what they are passed to once more
-    for node in range(count):
-        heap[node], counted[node, 0], counted[node, 1] = node, False, False
+    for number in range(space.before.shape[0]):
+        space.before[number] = beam.numbers[number]
     for position in range(count // 2 - 1, -1, -1):
         sink(new.bounds, heap, position, count)
-    while size < numbers.shape[0] and count > 0 and new.bounds[heap[0]] < best:
+    while size < space.before.shape[0] and count > 0 and new.bounds[heap[0]] < best:
         node = heap[0]
-        alike = is_like_another(new, node, space.beam, size, dedup2)
-        if alike or counted[node, 1]:
+        lane, lanes = node % TILE, new.lanes[node // TILE]
+        read_state(lane, lanes, beam.states[size], beam.motions[size])
+        alike, faults = is_like_another(beam, new.apart[node], size, dedup2), 0.0
+        new.apart[node] = size
+        if not alike and not new.counted[node, 1]:
+            read_positions(lane, end - begin, lanes, new.path)
+            if not new.counted[node, 0]:
+                faults, new.counted[node, 0] = count_faults(arrays, robot, end - begin, end, new.path), True
+            if faults == 0.0:
+                faults = float(count_met(table, queries, r, new.nearby, new.path, block))
+                new.counted[node, 1] = True
+        if faults == 0.0:
             count -= 1
             heap[0] = heap[count]
             if not alike:
-                keep(new, node, space.beam, size, numbers, space.ever)
+                keep(beam, size, new.faults[node], space.before[node // num_moves], node % num_moves, space.ever)
                 size += 1
         else:
-            faults = 0.0
-            if not counted[node, 0]:
-                faults, counted[node, 0] = count_faults(arrays, robot, end - begin, end, new.paths[node]), True
-            if faults == 0.0:
-                faults, counted[node, 1] = float(count_met(table, queries, r, new.paths[node], block)), True
             new.faults[node] += faults
             new.bounds[node] = rules.contact * new.faults[node] + new.costs[node]
         sink(new.bounds, heap, root, count)
@@ -117,53 +120,46 @@ def _move_follower(model: Model) -> Callable[..., int]:
     return tracker(model, by_moves)
 
 
-@inlined
-def _add_path(new: Beam, at: Whole, state: Row, velocity: Row, cost: float, bound: float, faults: float) -> None:
-    for axis in range(len(velocity)):
-        new.velocities[at, axis] = velocity[axis]
-    for i in range(len(state)):  # a mixed team's rows may be longer
-        new.states[at, i] = state[i]
-    new.costs[at], new.bounds[at], new.faults[at] = cost, bound, faults
-
-
 def _path_grower(model: Model) -> Callable[..., tuple[Whole, Ending]]:
     """Function that goes on from every path in the beam by every move for a block: how many paths are new, and the best
     one that arrives.
     """
-    drive_block, read_path = block_driver(model), path_reader(model)
+    drive_block, d = block_driver(model), model.dimension
 
     @inlined
     def grow_paths(
         arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, queries: Queries, r: int,
         space: BeamSpace, size: Whole, block: Whole, ending: Ending,
     ) -> tuple[Whole, Ending]:  # fmt: skip
-        beam, new, numbers, lanes = space.beam, space.new, space.numbers, space.lanes
-        robot, (begin, end) = queries.robots[r], steps_of(table, block)
-        count, num_moves = np.int64(0), moves.pace.shape[0]
-        best, best_number, best_move = ending
-        for first in range(0, size * num_moves, TILE):
-            together = min(TILE, size * num_moves - first)
-            drive_block(arrays, robot, moves, beam, first, together, end - begin, lanes)
-            for lane in range(together):
-                node, number = (first + lane) // num_moves, (first + lane) % num_moves
-                state, velocity, at_goal, cost = read_path(arrays, robot, lane, begin, lanes)
-                if rules.contact * beam.faults[node] + cost >= best:
+        beam, new, num_moves = space.beam, space.new, moves.pace.shape[0]
+        robot, (begin, end), total = queries.robots[r], steps_of(table, block), size * num_moves
+        for first in range(0, total, TILE):
+            together, lanes, costs = min(TILE, total - first), new.lanes[first // TILE], new.costs[first : first + TILE]
+            drive_block(arrays, robot, moves, beam, first, together, begin, end - begin, lanes, costs)
+        box = enclose_lanes(d, total, new.lanes)
+        find_nearby(table, robot, queries.others.exclude[r], box, block, new.nearby)
+        count, (best, best_number, best_move) = np.int64(0), ending
+        for node in range(total):
+            faults, cost = beam.faults[node // num_moves], new.costs[node]
+            if rules.contact * faults + cost >= best:
+                continue
+            lane, lanes = node % TILE, new.lanes[node // TILE]
+            if has_arrived(lane, lanes):
+                read_positions(lane, end - begin, lanes, new.path)
+                faults += count_faults(arrays, robot, end - begin, end_of(lane, lanes), new.path)
+                if rules.contact * faults + cost >= best:
                     continue
-                path, faults = new.paths[count], beam.faults[node]
-                read_positions(lane, end - begin, lanes, path)
-                if at_goal:
-                    faults += count_faults(arrays, robot, end - begin, end_of(lane, lanes), path)
-                    if rules.contact * faults + cost >= best:
-                        continue
-                    # It stays there: whoever comes by later counts too.
-                    faults += count_met(table, queries, r, path, block)
-                    faults += count_passing(table, queries, r, path, block)
-                    if rules.contact * faults + cost < best:
-                        best, best_number, best_move = rules.contact * faults + cost, numbers[node], number
-                    continue
-                _add_path(new, count, state, velocity, cost, rules.contact * faults + cost, faults)
-                new.before[count], new.moves[count] = numbers[node], number
-                count += 1
+                # It stays there: whoever comes by later counts too.
+                faults += count_met(table, queries, r, new.nearby, new.path, block)
+                left = best - (rules.contact * faults + cost)
+                faults += count_passing(table, queries, r, new.path, block, rules.contact, left)
+                if rules.contact * faults + cost < best:
+                    best, best_number = rules.contact * faults + cost, beam.numbers[node // num_moves]
+                    best_move = node % num_moves
+                continue
+            new.heap[count], new.counted[node, 0], new.counted[node, 1], new.apart[node] = node, False, False, 0
+            new.faults[node], new.bounds[node] = faults, rules.contact * faults + cost
+            count += 1
         return count, (best, best_number, best_move)
 
     return grow_paths
@@ -196,11 +192,11 @@ def search_kernel(name: str) -> Search:
         zero: Whole = np.int64(0)  # a literal would compile what it is passed to once more
         for i in range(n):
             space.beam.states[0, i] = queries.states[r, i]
-        space.beam.faults[0], space.numbers[0], size, space.ever.used[0] = 0.0, -1, zero + 1, 0
+        space.beam.faults[0], space.beam.numbers[0], size, space.ever.used[0] = 0.0, -1, zero + 1, 0
         ending = (queries.limits[r], zero - 1, zero - 1)
         for block in range(queries.blocks[r], table.first.shape[0]):
             count, ending = grow_paths(arrays, table, moves, rules, queries, r, space, size, block, ending)
-            size = _keep_best(arrays, table, rules, queries, r, space, count, block, ending[0])
+            size = _keep_best(arrays, table, moves, rules, queries, r, space, count, block, ending[0])
             if size == 0:
                 break
         _, number, move = ending
@@ -262,7 +258,7 @@ def _search(
 
     def look(_: IntArray) -> None:
         d, num_blocks = team.problem.dimension, len(table.first)
-        space = make_beam_space(rules.width, len(moves.pace), num_blocks, x.shape[2], d, LANES)
+        space = make_beam_space(rules.width, len(moves.pace), num_blocks, x.shape[2], d, LANES, team.problem.num_robots)
         for number in waiting:
             if team.search.should_stop():
                 break
