@@ -120,11 +120,11 @@ class WorkingPlan:
         positions = np.concatenate([self.positions[None, :, robot], paths])
         arrives = np.append(self.arrived[robot], arrived)
         # Most paths turn to the goal where the robot heads for it anyhow. Equal ones are checked once.
-        alike = (positions[:, None] == positions[:2]).all(axis=(2, 3)) & (arrives[:, None] == arrives[:2])
-        same = np.where(alike.any(axis=1), alike.argmax(axis=1), np.arange(len(positions)))
-        different, which = np.unique(same, return_inverse=True)
-        if len(different) == 1:
+        seen = dict[tuple[bytes, bool], int]()
+        which = [seen.setdefault((path.tobytes(), bool(arrives[v])), len(seen)) for v, path in enumerate(positions)]
+        if len(seen) == 1:
             return np.zeros(len(positions))
+        different = [which.index(number) for number in range(len(seen))]
         costs: Floats = self._costs([robot], positions[None, different], arrives[None, different])[0][0, which]
         return costs
 

@@ -144,7 +144,8 @@ def _better_roundabout(search: SolveRun) -> Trajectory | None:
 def improve_first_paths(team: WorkingPlan, rounds: int = FIRST_ROUNDS) -> None:
     """Take what faster paths there are at once for a team in which none fails, in so many rounds."""
     rounds = min(rounds, FIRST_ROBOT_STEPS // (team.problem.num_robots * team.problem.horizon))
-    improve_paths(team, team.search.iteration_seed(Stream.NEIGHBOURHOODS), rounds, temperature=0.0)
+    if rounds > 0:
+        improve_paths(team, team.search.iteration_seed(Stream.NEIGHBOURHOODS), rounds, temperature=0.0)
 
 
 def improve_paths(team: WorkingPlan, seed: int, rounds: int, temperature: float = TEMPERATURE) -> FloatArray:
