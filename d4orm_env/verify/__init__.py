@@ -71,8 +71,8 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
     array = _checked_controls(problem, controls)
     if not np.isfinite(array).all():
         return _left_out(problem, _non_finite(array, problem.dt))
-    # Once all have docked nothing moves, mostly long before the horizon.
-    busy = int(np.flatnonzero(array.any(axis=(1, 2))).max(initial=0)) + 1
+    # Once all have docked nothing moves, mostly long before the horizon: a step of that is enough.
+    busy = int(np.flatnonzero(array.any(axis=(1, 2))).max(initial=0)) + 2
     docks_alone = problem.arrival != "stay" and set(problem.team.models) <= set(MODELS)
     report = _judge(problem, array[:busy]) if docks_alone and busy < len(array) else None
     if report is None or not np.isfinite(report.arrival_times).all():

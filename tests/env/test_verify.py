@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import math
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ from d4orm_env.core.world import World
 from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.verify import VerificationReport, Violation, verify
 
+verify_module = importlib.import_module("d4orm_env.verify")
 CHORD = 3e-5  # what curves and chords may differ by, for a pair
 
 
@@ -146,6 +148,23 @@ def test_a_docked_robot_stands_where_it_docked():
     assert report.ok
     np.testing.assert_allclose(report.arrival_times, [1.0, 4.0])
     assert report.min_separation == pytest.approx(0.2, abs=1e-6)
+
+
+def test_only_the_time_until_all_have_docked_is_judged(monkeypatch):
+    """Nobody waits for the horizon, but for who coasts to the goal: the second robot drifts there after its push."""
+    problem = make(["holonomic2d"] * 2, [(0, 0), (0, 5)], [(0.1, 0), (1.5, 5)], goal_radius=0.1, dt=0.1, horizon=400)
+    controls, judged = np.zeros((400, 2, 2)), []
+    controls[:2, :, 0] = 1.0
+    motion = verify_module.TeamMotion
+    monkeypatch.setattr(verify_module, "TeamMotion", lambda *args: judged.append(len(args[1])) or motion(*args))
+    both = verify(problem, controls)
+    assert both.ok
+    assert judged == [3, 400]
+    first = problem.select([0])
+    alone = verify(first, controls[:, :1])
+    assert judged[2:] == [3]
+    assert alone.arrival_times[0] == both.arrival_times[0]
+    assert str(alone) == str(verify(first.replace(horizon=3), controls[:3, :1]))
 
 
 def test_mixed_team_moves_as_its_robots_do_alone():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,7 +15,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine.threads import Threads
-from d4orm_planners.engine import path_index
+from d4orm_planners.engine import path_index, path_table
 from d4orm_planners.engine.path_index import PathIndex, check_alone
 
 RADIUS = np.array([0.125, 0.25, 0.5, 0.0, 0.25])
@@ -56,6 +57,31 @@ def test_robots_that_were_moved_are_found_where_they_are(paths: np.ndarray, othe
     changed[:, [3, 0]] = others
     np.testing.assert_array_equal(index.positions, changed)
     np.testing.assert_array_equal(index.pairs(), PathIndex(changed, RADIUS, 0.1).pairs())
+
+
+@numba.njit
+def _both_counts(table, robot, exclude, path, block, box, nearby):
+    first, _ = path_table.steps_of(table, block)
+    path_table.find_nearby(table, robot, exclude, box, block, nearby)
+    many = path_table.count_near(table, robot, exclude, path, first, block)
+    return many, path_table.count_among(table, robot, nearby, path, block)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@given(st.data(), st.floats(0, 1))
+def test_counting_among_those_nearby_is_counting_in_buckets(dimension: int, data: Any, margin: float) -> None:
+    """Even where cells share a bucket, and a robot counts twice."""
+    index, others = PathIndex(data.draw(drawn_paths(dimension)), RADIUS, margin), data.draw(drawn_paths(dimension, 1))
+    nearby, exclude = path_table.make_nearby(5), np.array([2, 4])
+    for block in range(3):
+        path = np.zeros((path_table.BLOCK, dimension), np.float32)
+        steps = others[1 + block * path_table.BLOCK :][: path_table.BLOCK, 0]
+        path[: len(steps)] = steps
+        low, high = (
+            tuple(np.pad(end(axis=0).astype(float), (0, 3 - dimension)).tolist()) for end in (steps.min, steps.max)
+        )
+        many, few = _both_counts(index.table, 4, exclude, path, block, (low, high), nearby)
+        assert many == few
 
 
 def test_who_has_stopped_is_still_met_by_who_comes_later() -> None:
