@@ -29,6 +29,7 @@ from d4orm_planners.engine.path_table import BLOCK, PathTable, find_nearby, step
 from d4orm_planners.mapf.beam import (
     BeamRules,
     BeamSpace,
+    Branches,
     OtherAgents,
     Queries,
     count_met,
@@ -58,6 +59,39 @@ Ending: TypeAlias = tuple[float, Whole, Whole]
 
 
 @inlined
+def _count_next(
+    arrays: ProblemArrays, table: PathTable, queries: Queries, r: int, new: Branches, node: Whole, block: Whole
+) -> float:
+    """What a path does wrong by itself in the block and, unless that is something, or was counted, whom it meets."""
+    robot, (begin, end), faults = queries.robots[r], steps_of(table, block), 0.0
+    read_positions(node % TILE, end - begin, new.lanes[node // TILE], new.path)
+    if not new.counted[node, 0]:
+        faults, new.counted[node, 0] = count_faults(arrays, robot, end - begin, end, new.path), True
+    if faults == 0.0:
+        faults = float(count_met(table, queries, r, new.nearby, new.path, block))
+        new.counted[node, 1] = True
+    return faults
+
+
+@inlined
+def _count_to_end(
+    arrays: ProblemArrays, table: PathTable, rules: BeamRules, queries: Queries, r: int, new: Branches, node: Whole,
+    block: Whole, faults: float, best: float,
+) -> float:  # fmt: skip
+    """The faults of a path that arrives in the block, so many before; fewer where it costs more than the best."""
+    robot, (begin, end), cost = queries.robots[r], steps_of(table, block), new.costs[node]
+    lane, lanes = node % TILE, new.lanes[node // TILE]
+    read_positions(lane, end - begin, lanes, new.path)
+    faults += count_faults(arrays, robot, end - begin, end_of(lane, lanes), new.path)
+    if rules.contact * faults + cost >= best:
+        return faults
+    # It stays there: whoever comes by later counts too.
+    faults += count_met(table, queries, r, new.nearby, new.path, block)
+    left = best - (rules.contact * faults + cost)
+    return faults + count_passing(table, queries, r, new.path, block, rules.contact, left)
+
+
+@inlined
 def _keep_best(
     arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, queries: Queries, r: int,
     space: BeamSpace, count: Whole, block: Whole, best: float,
@@ -68,8 +102,7 @@ def _keep_best(
     which then comes again.
     """
     beam, new, heap = space.beam, space.new, space.new.heap
-    robot, (begin, end), num_moves = queries.robots[r], steps_of(table, block), moves.pace.shape[0]
-    dedup2 = rules.dedup_distance * rules.dedup_distance
+    num_moves, dedup2 = moves.pace.shape[0], rules.dedup_distance * rules.dedup_distance
     root = size = np.int64(0)  # literals would compile what they are passed to once more
     for number in range(space.before.shape[0]):
         space.before[number] = beam.numbers[number]
@@ -82,12 +115,7 @@ def _keep_best(
         alike, faults = is_like_another(beam, new.apart[node], size, dedup2), 0.0
         new.apart[node] = size
         if not alike and not new.counted[node, 1]:
-            read_positions(lane, end - begin, lanes, new.path)
-            if not new.counted[node, 0]:
-                faults, new.counted[node, 0] = count_faults(arrays, robot, end - begin, end, new.path), True
-            if faults == 0.0:
-                faults = float(count_met(table, queries, r, new.nearby, new.path, block))
-                new.counted[node, 1] = True
+            faults = _count_next(arrays, table, queries, r, new, node, block)
         if faults == 0.0:
             count -= 1
             heap[0] = heap[count]
@@ -143,16 +171,8 @@ def _path_grower(model: Model) -> Callable[..., tuple[Whole, Ending]]:
             faults, cost = beam.faults[node // num_moves], new.costs[node]
             if rules.contact * faults + cost >= best:
                 continue
-            lane, lanes = node % TILE, new.lanes[node // TILE]
-            if has_arrived(lane, lanes):
-                read_positions(lane, end - begin, lanes, new.path)
-                faults += count_faults(arrays, robot, end - begin, end_of(lane, lanes), new.path)
-                if rules.contact * faults + cost >= best:
-                    continue
-                # It stays there: whoever comes by later counts too.
-                faults += count_met(table, queries, r, new.nearby, new.path, block)
-                left = best - (rules.contact * faults + cost)
-                faults += count_passing(table, queries, r, new.path, block, rules.contact, left)
+            if has_arrived(node % TILE, new.lanes[node // TILE]):
+                faults = _count_to_end(arrays, table, rules, queries, r, new, node, block, faults, best)
                 if rules.contact * faults + cost < best:
                     best, best_number = rules.contact * faults + cost, beam.numbers[node // num_moves]
                     best_move = node % num_moves
