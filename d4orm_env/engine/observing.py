@@ -14,6 +14,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
+from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined
 from d4orm_env.engine.ray_shapes import is_blocked
@@ -48,7 +49,8 @@ class ObservationSpec(NamedTuple):
     num_neighbors: int  #: Robots in it
     num_obstacles: int  #: Obstacles in it
     squared_range: np.float32  #: Square of the distance beyond which robots are not observed [m²]
-    line_of_sight: bool  #: Whether those behind obstacles are not observed either
+    #: True if those behind obstacles are not observed either, else ``None``, which leaves rays out of a kernel
+    line_of_sight: bool | None
 
 
 @numba.njit(nogil=True, **OPTIONS)
@@ -65,22 +67,22 @@ def allocate_sensed(num_robots: int, num_bodies: int, dimension: int, view: Obse
 @compiled
 def _hide(
     position: FloatArray, positions: FloatArray, boxes: FloatArray, triangles: FloatArray, squared_range: np.float32,
-    line_of_sight: bool, ray: FloatArray, hidden: BoolArray,
+    line_of_sight: bool | None, ray: FloatArray, hidden: BoolArray,
 ) -> None:  # fmt: skip
-    """Mark robots that are not observed from a position: beyond a range, and behind obstacles if asked."""
+    """Mark robots that are not observed from a position: beyond a range, and behind obstacles unless it is ``None``."""
     for other in range(hidden.shape[0]):
         gap2 = ZERO
         for axis in range(position.shape[0]):
             gap = positions[other, axis] - position[axis]
             gap2 += gap * gap
         hidden[other] = gap2 > squared_range
-        if line_of_sight and not hidden[other]:
-            hidden[other] = is_blocked(position, positions[other], boxes, triangles, ray)
+        if line_of_sight is not None:
+            hidden[other] = hidden[other] or is_blocked(position, positions[other], boxes, triangles, ray)
 
 
 @cached_kernel(**OPTIONS)
 def _hide_each(
-    positions: FloatArray, boxes: FloatArray, triangles: FloatArray, squared_range: np.float32, sight: bool,
+    positions: FloatArray, boxes: FloatArray, triangles: FloatArray, squared_range: np.float32, sight: bool | None,
     ray: FloatArray, hidden: BoolArray,
 ) -> None:  # fmt: skip
     for k in range(len(positions)):
@@ -98,7 +100,7 @@ def communication_links(
     hidden = np.empty((len(positions), len(positions)), np.bool_)
     square = np.float32(np.inf if communication_range is None else communication_range**2)
     rows, ray = np.ascontiguousarray(positions, np.float32), np.empty((5, 1), np.float32)
-    _hide_each(rows, problem.arrays.boxes, problem.arrays.triangles, square, line_of_sight, ray, hidden)
+    _hide_each(rows, problem.arrays.boxes, problem.arrays.triangles, square, line_of_sight or None, ray, hidden)
     return ~hidden & ~np.eye(len(hidden), dtype=np.bool_)
 
 
@@ -139,7 +141,7 @@ def observe(
         sensed.radius[k] = arrays.radius[k]
     for k in range(num_robots):
         row = out[k]
-        if view.line_of_sight or view.squared_range < np.inf:
+        if view.line_of_sight is not None or view.squared_range < np.inf:
             _hide(
                 sensed.position[k], sensed.position, arrays.boxes, arrays.triangles, view.squared_range,
                 view.line_of_sight, sensed.ray, sensed.hidden,
@@ -168,7 +170,8 @@ def observe_worlds_kernel(
     ) -> None:
         num_robots, dimension = arrays.goal.shape
         w = aligned_zeros(num_robots * STRIDE)
-        sensed = allocate_sensed(num_robots, sight.bodies.shape[1], dimension, view)
+        sensed = borrow(allocate_sensed(num_robots, sight.bodies.shape[1], dimension, view))
+        arrays, sight = borrow(arrays), borrow(sight)
         for index in range(tile_range[0], tile_range[1]):
             first = index * TILE
             load(sight, first, w)
