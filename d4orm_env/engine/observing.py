@@ -170,8 +170,8 @@ def observe_worlds_kernel(
     ) -> None:
         num_robots, dimension = arrays.goal.shape
         w = aligned_zeros(num_robots * STRIDE)
-        sensed = borrow(allocate_sensed(num_robots, sight.bodies.shape[1], dimension, view))
-        arrays, sight = borrow(arrays), borrow(sight)
+        sensed = allocate_sensed(num_robots, sight.bodies.shape[1], dimension, view)
+        arrays = borrow(arrays)
         for index in range(tile_range[0], tile_range[1]):
             first = index * TILE
             load(sight, first, w)
