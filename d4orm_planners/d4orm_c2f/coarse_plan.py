@@ -201,14 +201,14 @@ class CoarsePlanning:
         last_step: Time steps after which the episode ends; ``None`` if it goes on after robots arrive.
 
     Attributes:
-        planner: Planner of the coarse plans.
+        planner: Planner of the coarse plans; ``thorough`` is that of teams that are stuck or lost.
         judged: Whether these must pass ``verify()``, which takes most of the time of cars, in Python, and delays loops.
     """
 
     def __init__(self, config: D4ormC2FConfig, seed: int, last_step: int | None) -> None:
         self._config, self._seed, self._last_step, self.judged = config, seed, last_step, config.deadline is None
         # Fine plans cannot keep to paths between others to the centimetre. If a team is stuck there may be no others.
-        self.planner, self._thorough = (_coarse_planner(config, reroute=reroute) for reroute in (False, True))
+        self.planner, self.thorough = (_coarse_planner(config, reroute=reroute) for reroute in (False, True))
 
     def warm_start(self, problem: Problem, joint: JointState) -> FloatArray | None:
         """``(H_c, K, m)`` controls of a policy's episode from here, if the coarse plan is to begin with these.
@@ -238,7 +238,7 @@ class CoarsePlanning:
         goals = np.where(arrived[:, None], joint.states[:, : problem.dimension], joint.goals)
         coarse = coarse_problem(problem.with_state(joint.states, goals), self._config.coarse_factor)
         seed = derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps)
-        planner = self._thorough if thorough else self.planner
+        planner = self.thorough if thorough else self.planner
         search = partial(self._searched, planner=planner, seed=seed, initial=initial, iterations=iterations)
         chosen, guidance = _discs_first(search, coarse)
         last = joint.steps if self._last_step is None else self._last_step

@@ -81,8 +81,16 @@ class CoarsePlanTracker:
         self._stagnation, self.stuck = StagnationMonitor(joint), ~all_robots
         warm = self._planning.warm_start(self.problem, joint)
         self.guidance = self._planning.plan(self.problem, joint, arrived, warm, self._config.coarse_iterations)
+        if self._config.replan and self._config.deadline is not None:
+            self._prepare(joint)
         self.index = 0
         self._follow(joint, self._relayed(joint, all_robots) or self.guidance, all_robots)
+
+    def _prepare(self, joint: JointState) -> None:
+        """Load, or compile, what only thorough plans need: later that would hold up the control loops beside them."""
+        coarse = coarse_problem(self.problem.with_state(joint.states, joint.goals), self._config.coarse_factor)
+        thorough = self._planning.thorough
+        thorough.init(SolveRun(thorough, coarse, self._seed, judged=self._planning.judged))
 
     def _follow(self, joint: JointState, guidance: CoarseWaypoints, rerouted: BoolArray) -> None:
         """Begin a new guidance, in which robots ``rerouted`` ``(K,)`` have new paths."""

@@ -36,6 +36,7 @@ from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 from d4orm_planners.engine.sampling_types import SamplingResult, get_sampling_engine
+from d4orm_planners.mapf import beam_search
 from d4orm_planners.tracking.steering import straight_drives
 
 CASES = [
@@ -325,6 +326,15 @@ def test_no_loop_waits_for_a_new_coarse_plan(monkeypatch: pytest.MonkeyPatch) ->
     steps(1)
     assert policy.guidance is not first
     assert policy.loops[-1].replanned
+
+
+@pytest.mark.parametrize("deadline", [None, 60.0])
+def test_what_thorough_plans_need_is_there_before_the_first_loop_with_a_deadline(deadline: float | None) -> None:
+    beam_search.search_kernel.cache_clear()
+    env = navigation_v0.parallel_env(problem=circle(4))
+    env.reset(seed=0)
+    controller(deadline=deadline).reset(env)
+    assert bool(beam_search.search_kernel("holonomic2d").signatures) == (deadline is not None)
 
 
 @pytest.mark.parametrize(("deadline", "judged"), [(None, True), (60.0, False)])
@@ -690,7 +700,7 @@ def test_a_plan_that_comes_before_the_episode_ends_is_preferred(seed: int) -> No
 
 def test_only_thorough_plans_keep_to_paths_between_others() -> None:
     planning = CoarsePlanning(D4ormC2FConfig(), seed=0, last_step=None)
-    assert [planner.config.reroute for planner in (planning.planner, planning._thorough)] == [False, True]  # type: ignore[attr-defined]
+    assert [planner.config.reroute for planner in (planning.planner, planning.thorough)] == [False, True]  # type: ignore[attr-defined]
 
 
 def test_who_is_behind_robots_that_have_docked_is_barred() -> None:
