@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.interpolate import BPoly, PPoly
+from scipy.interpolate import BPoly, BSpline, PPoly, make_interp_spline
 
 from d4orm_env.core.arrays import LARGEST, Floats, positive_number, real_number
 from d4orm_env.core.errors import unknown
@@ -26,7 +26,7 @@ from d4orm_env.core.files import make_folder, writing
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.verify import VerificationReport
 from d4orm_planners.tracking.ros_messages import write_bag
-from d4orm_planners.tracking.smoothing import SmoothMotion, least_overhead, verify_motion
+from d4orm_planners.tracking.smoothing import SmoothMotion, drive_at_start, least_overhead
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,6 +42,8 @@ CLOSE = 1 / 50
 """Largest distance from the motion that is aimed at, as a share of the smallest robot's radius."""
 CHECKS = 32
 """Times a piece at which that distance is looked at."""
+MEETING = 4
+"""Derivatives, the values included, in which pieces agree where they meet."""
 AXES = ("x", "y", "z", "yaw")
 
 
@@ -106,45 +108,65 @@ def sample_motion(motion: SmoothMotion, rate: float) -> Setpoints:
     )
 
 
-def fit_polynomials(motion: SmoothMotion, height: float) -> tuple[Floats, Floats]:
-    """The fewest pieces that stay close to a motion, or as many as there is memory for.
+class Polynomials(NamedTuple):
+    """Pieces of a motion for robots that hold them on board."""
+
+    motion: SmoothMotion  #: What they describe
+    durations: Floats  #: ``(P,)``, all equal [s]
+    #: ``(P, K, 4, 8)`` of x, y, z [m] and yaw [rad], from the constant up, by the time in the piece
+    coefficients: Floats
+
+
+def fit_polynomials(motion: SmoothMotion, height: float) -> Polynomials:
+    """The fewest pieces that stay close to a motion, or as many as there is memory for, as slow as its limits need.
 
     Args:
         motion: Of the team.
         height: z of a team that moves in the plane [m].
 
-    Returns:
-        ``(P,)`` durations, all equal [s], and ``(P, K, 4, 8)`` coefficients of x, y, z [m] and yaw [rad], from the
-        constant up, by the time in the piece.
-
     Raises:
-        ValueError: If the motion is too long for as many: robots would touch, or not end at their goals.
+        ValueError: If the motion is too long for as many: robots would touch, or not end at their goals; or those that
+            drive at the start would have to drive more slowly.
     """
     for count in range(1, MOST_PIECES + 1):
         curves, deviation = _pieces(motion, count)
         if deviation <= CLOSE * float(motion.problem.team.radius.min()):
             break
-    position, heading = PPoly(curves.c[..., :-1], curves.x), PPoly(curves.c[..., -1], curves.x)
-    report = verify_motion(motion.problem, position, heading, motion.duration, count * CHECKS + 1)
-    if not report.ok:
+    spline = _as_spline(curves)
+    ways, turns = (BSpline(spline.t, part, spline.k) for part in (spline.c[..., :-1], spline.c[..., -1]))
+    same = replace(motion, curves=ways, headings=turns, deviation=motion.deviation + deviation)
+    found, trouble = same.within(), ""
+    if found.stretch > (1 + CLOSE) * motion.stretch and drive_at_start(motion.problem):
+        trouble = "beyond the limits of robots, and these drive at the start, so they cannot take longer"
+    if trouble := trouble or next(map(str, found.report.violations), ""):
         raise ValueError(
             f"{count} polynomials, which is all that {MEMORY} bytes on board hold, are up to {deviation:.3g} m off a "
-            f"motion of {motion.duration:.0f} s: {report.violations[0]}; export shorter plans one after the other"
+            f"motion of {motion.duration:.0f} s: {trouble}; export shorter plans one after the other"
         )
-    return np.diff(curves.x), _coefficients(motion, curves, height)
+    durations, coefficients = np.diff(curves.x) * found.stretch, _coefficients(motion, curves, height)
+    return Polynomials(found, durations, coefficients / found.stretch ** np.arange(coefficients.shape[-1]))
 
 
 def _pieces(motion: SmoothMotion, count: int) -> tuple[PPoly, float]:
-    """Positions and headings ``(K, d+1)`` in so many pieces, and how far the positions are off [m]."""
-    ends = np.linspace(0, motion.duration, count + 1)
+    """Positions and headings ``(K, d+1)`` in so many pieces by the plan's time, and how far positions are off [m]."""
+    usual = replace(motion, stretch=1.0)
+    ends = np.linspace(0, usual.duration, count + 1)
     values = [
-        np.concatenate([motion.position(ends, order), motion.heading(ends, order)[..., None]], axis=2)
-        for order in range(4)
+        np.concatenate([usual.position(ends, order), usual.heading(ends, order)[..., None]], axis=2)
+        for order in range(MEETING)
     ]
     curves = PPoly.from_bernstein_basis(BPoly.from_derivatives(ends, np.stack(values, axis=1)))
-    times = np.linspace(0, motion.duration, count * CHECKS + 1)
-    offset = curves(times)[..., :-1] - motion.position(times)
+    times = np.linspace(0, usual.duration, count * CHECKS + 1)
+    offset = curves(times)[..., :-1] - usual.position(times)
     return curves, float(np.linalg.norm(offset, axis=2).max())
+
+
+def _as_spline(curves: PPoly) -> BSpline:
+    """The same as a spline, which motions are made of: through as many of its values as it has coefficients."""
+    degree = len(curves.c) - 1
+    knots = np.repeat(curves.x, [degree + 1, *[MEETING] * (len(curves.x) - 2), degree + 1])
+    sites = np.convolve(knots[1:-1], np.full(degree, 1 / degree), "valid").clip(0, curves.x[-1])
+    return make_interp_spline(sites, curves(sites), k=degree, t=knots)
 
 
 def _coefficients(motion: SmoothMotion, curves: PPoly, height: float) -> Floats:
@@ -159,12 +181,12 @@ def _coefficients(motion: SmoothMotion, curves: PPoly, height: float) -> Floats:
 
 @dataclass(frozen=True)
 class ExportReport:
-    """Files that were written, and the figures of the motion in them."""
+    """Files that were written, and the figures of the motion in them: of the polynomials where these are written."""
 
     files: tuple[Path, ...]  #: Their paths
     duration: float  #: Of the motion [s]
     stretch: float  #: Times the plan's duration that it takes
-    deviation: float  #: Largest distance from the plan at its steps [m]
+    deviation: float  #: Largest distance from the plan at its steps, of polynomials at most [m]
     min_separation: float  #: Least gap between two robots [m]
     min_clearance: float  #: Least gap to an obstacle or bound [m]
     #: Least height of a robot above another that it flies over [m]; infinite where none does, or in the plane
@@ -178,17 +200,16 @@ class ExportReport:
         return None if self.pieces is None else self.pieces * PIECE_BYTES
 
 
-def _csv(motion: SmoothMotion, setpoints: Setpoints, folder: Path, height: float) -> int | None:
+def _csv(motion: SmoothMotion, setpoints: Setpoints, folder: Path, height: float) -> None:
     columns = setpoints.columns()
     if motion.problem.dimension == 2 and height:
         columns = columns | {"z": np.full_like(setpoints.heading, height)}
     for robot in range(motion.problem.num_robots):
         values = np.column_stack([setpoints.time, *(column[:, robot] for column in columns.values())])
         _write_table(folder / f"robot_{robot}.csv", ["time", *columns], values)
-    return None
 
 
-def _crazyswarm2(motion: SmoothMotion, setpoints: Setpoints, folder: Path, height: float) -> int | None:
+def _crazyswarm2(motion: SmoothMotion, setpoints: Setpoints, folder: Path, height: float) -> Polynomials:
     if motion.problem.dimension == 2 and height <= 0:
         raise ValueError(
             f"height is {height:g} m; a team that moves in the plane flies above 0: give height= (--height), as 1.0"
@@ -199,21 +220,20 @@ def _crazyswarm2(motion: SmoothMotion, setpoints: Setpoints, folder: Path, heigh
             f"robot_{robot} comes down to z = {lowest[robot]:.2f} m, and the floor is at 0; plan with bounds above the "
             "floor, or from a greater height"
         )
-    durations, coefficients = fit_polynomials(motion, height)
+    polynomials = fit_polynomials(motion, height)
     header = ["Duration", *(f"{axis}^{power}" for axis in AXES for power in range(8))]
     for robot in range(motion.problem.num_robots):
-        rows = coefficients[:, robot].reshape(len(durations), -1)
-        _write_table(folder / f"robot_{robot}.csv", header, np.column_stack([durations, rows]))
-    return len(durations)
+        rows = polynomials.coefficients[:, robot].reshape(len(polynomials.durations), -1)
+        _write_table(folder / f"robot_{robot}.csv", header, np.column_stack([polynomials.durations, rows]))
+    return polynomials
 
 
-def _bag(storage: str, motion: SmoothMotion, setpoints: Setpoints, folder: Path, height: float) -> int | None:
+def _bag(storage: str, motion: SmoothMotion, setpoints: Setpoints, folder: Path, height: float) -> None:
     write_bag(setpoints, folder / "motion", height, storage)
-    return None
 
 
-Writer = Callable[[SmoothMotion, Setpoints, Path, float], int | None]
-"""It writes a motion into an empty folder, and returns how many polynomials a robot has."""
+Writer = Callable[[SmoothMotion, Setpoints, Path, float], Polynomials | None]
+"""It writes a motion into an empty folder, and returns the polynomials if that is what it writes."""
 
 FORMATS: Mapping[str, Writer] = MappingProxyType(
     {"csv": _csv, "crazyswarm2": _crazyswarm2, "rosbag2": partial(_bag, "SQLITE3"), "mcap": partial(_bag, "MCAP")}
@@ -241,7 +261,7 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
     setpoints = sample_motion(motion, rate)
     make_folder(folder.parent)
     with writing(folder), TemporaryDirectory(dir=folder.parent, prefix=".export") as name:
-        pieces = FORMATS[form](motion, setpoints, Path(name), height)
+        polynomials = FORMATS[form](motion, setpoints, Path(name), height)
         names = sorted(path.name for path in Path(name).iterdir())
         _refuse_others(folder, names)
         folder.mkdir(exist_ok=True)
@@ -249,6 +269,9 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
             if (folder / entry).is_dir():
                 shutil.rmtree(folder / entry)
             (Path(name) / entry).replace(folder / entry)
+    if polynomials is not None:
+        motion = polynomials.motion
+        setpoints = sample_motion(motion, rate)
     heights = setpoints.position[..., 2] if motion.problem.dimension == 3 else np.array(height)
     return ExportReport(
         tuple(folder / entry for entry in names),
@@ -259,7 +282,7 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
         motion.report.min_clearance,
         least_overhead(motion.problem, setpoints.position),
         (float(heights.min()), float(heights.max())),
-        pieces,
+        None if polynomials is None else len(polynomials.durations),
     )
 
 

@@ -9,7 +9,6 @@ more from the plan: of several, the quickest is taken that is free of collisions
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -105,6 +104,7 @@ class SmoothMotion:
     """A team's motion as splines over the plan's own time, driven ``stretch`` times as slowly."""
 
     problem: Problem  #: The team and its world
+    limits: MotionLimits  #: Not to be exceeded
     curves: BSpline  #: Of :meth:`position`, ``(K, d)`` by the plan's time [m]
     headings: BSpline  #: ``(K,)`` by the plan's time [rad]; zero for robots without one
     curvatures: BSpline  #: ``(K,)`` by the plan's time [1/m], steered at rest too; zero for robots that do not steer
@@ -155,8 +155,11 @@ class SmoothMotion:
 
     @cached_property
     def report(self) -> VerificationReport:
-        """Verdict of :func:`d4orm_env.verify.curves.verify_curves`."""
-        return verify_motion(self.problem, self.position, self.heading, self.duration, self._num_samples)
+        """Verdict of :func:`d4orm_env.verify.curves.verify_curves`, by the sharpest bends at some samples."""
+        times = np.linspace(0, self.duration, self._num_samples)
+        turned = self.problem.team.radius * (np.abs(self.heading(times, 2)) + self.heading(times, 1) ** 2)
+        bend = (np.linalg.norm(self.position(times, 2), axis=2) + turned).max(axis=0)
+        return verify_curves(self.problem, self.position, self.duration, bend, self.heading)
 
     @property
     def _drag(self) -> Floats:
@@ -168,34 +171,20 @@ class SmoothMotion:
     def _num_samples(self) -> int:
         return round(self.curves.t[-1] / self.problem.dt) * PER_STEP + 1
 
-    def within(self, limits: MotionLimits) -> SmoothMotion:
-        """The same motion, as slow as these limits need."""
-        return replace(self, stretch=self.stretch * max(1.0, *(needed for needed, _ in self.needed(limits).values())))
+    def within(self) -> SmoothMotion:
+        """The same motion, as slow as its limits need."""
+        return replace(self, stretch=self.stretch * max(1.0, *(needed for needed, _ in self.needed().values())))
 
-    def needed(self, limits: MotionLimits) -> dict[str, tuple[float, int]]:
+    def needed(self) -> dict[str, tuple[float, int]]:
         """Factors by which each of :data:`LIMITS` needs the motion slower, and the robots that they are for."""
         needed = {}
         for name, (_, power) in LIMITS.items():
-            share = (1 + RESERVE) * getattr(self.peaks, name) / getattr(limits, name)
+            share = (1 + RESERVE) * getattr(self.peaks, name) / getattr(self.limits, name)
             # Drag falls less than accelerations do.
             powers = np.where((name == "acceleration") & (self._drag > 0), 1, power)
             slower = np.maximum(share, 0.0) ** (1 / powers)
             needed[name] = float(slower.max()), int(np.argmax(slower))
         return needed
-
-
-Values = Callable[..., Floats]
-"""``(times, derivative=0)``: values of the whole team at times ``(T,)`` [s], or derivatives of them."""
-
-
-def verify_motion(
-    problem: Problem, position: Values, heading: Values, duration: float, num_samples: int
-) -> VerificationReport:
-    """Verdict of :func:`d4orm_env.verify.curves.verify_curves`, by the sharpest bends at so many samples."""
-    times = np.linspace(0, duration, num_samples)
-    turned = problem.team.radius * (np.abs(heading(times, 2)) + heading(times, 1) ** 2)
-    bend = (np.linalg.norm(position(times, 2), axis=2) + turned).max(axis=0)
-    return verify_curves(problem, position, duration, bend, heading)
 
 
 def least_overhead(problem: Problem, positions: Floats) -> float:
@@ -224,15 +213,15 @@ def smooth_motion(problem: Problem, trajectory: Trajectory, limits: MotionLimits
         ValueError: If there is none, with what is in its way; or if robots that drive at the start would have to drive
             more slowly than they do.
     """
-    fitted = (_fitted(problem, trajectory, smoothness) for smoothness in SMOOTHNESS)
-    motions = sorted((motion.within(limits) for motion in fitted), key=lambda motion: motion.stretch)
+    fitted = (_fitted(problem, trajectory, limits, smoothness) for smoothness in SMOOTHNESS)
+    motions = sorted((motion.within() for motion in fitted), key=lambda motion: motion.stretch)
     best = motions[0]
-    if _initial_velocity(problem).any():
+    if drive_at_start(problem):
         if best.stretch > 1 + RESERVE:
-            raise ValueError(_too_fast(best, limits, "its robots drive at the start, so they cannot take longer"))
+            raise ValueError(_too_fast(best, "its robots drive at the start, so they cannot take longer"))
         motions = [replace(motion, stretch=1.0) for motion in motions if motion.stretch <= 1 + RESERVE]
     if best.stretch > SLOWEST:
-        raise ValueError(_too_fast(best, limits, f"it would take {best.stretch:.1f} times as long"))
+        raise ValueError(_too_fast(best, f"it would take {best.stretch:.1f} times as long"))
     for motion in motions:
         if motion.report.ok and motion.stretch <= SLOWEST:
             return motion
@@ -243,12 +232,12 @@ def smooth_motion(problem: Problem, trajectory: Trajectory, limits: MotionLimits
     raise ValueError(f"smoothed, the plan fails: {violation}; {remedy}")
 
 
-def _too_fast(motion: SmoothMotion, limits: MotionLimits, why: str) -> str:
+def _too_fast(motion: SmoothMotion, why: str) -> str:
     usual = replace(motion, stretch=1.0)
-    needed = usual.needed(limits)
+    needed = usual.needed()
     name = max(needed, key=lambda name: needed[name][0])
     robot = needed[name][1]
-    most, limit = getattr(usual.peaks, name)[robot], getattr(limits, name)[robot]
+    most, limit = getattr(usual.peaks, name)[robot], getattr(motion.limits, name)[robot]
     values = f"{most:.3g} {LIMITS[name][0]} of {name.replace('_', ' ')}, limit {limit:.3g}"
     demand, stops = f"robot_{robot} needs {values}, and {why}", usual.problem.goal_speed[robot] == np.inf
     stops &= not usual.problem.team.robot_models[robot].first_order
@@ -258,13 +247,18 @@ def _too_fast(motion: SmoothMotion, limits: MotionLimits, why: str) -> str:
     return f"smoothed, the plan asks for too much: {demand}; {', or '.join(remedies)}"
 
 
+def drive_at_start(problem: Problem) -> bool:
+    """Check whether a robot does, so that the team cannot drive more slowly."""
+    return bool(_initial_velocity(problem).any())
+
+
 def _initial_velocity(problem: Problem) -> Floats:
     """``(K, d)`` velocities at the start [m/s]."""
     no_controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
     return present_velocities(problem, problem.start, no_controls).astype(np.float64)
 
 
-def _fitted(problem: Problem, trajectory: Trajectory, smoothness: float) -> SmoothMotion:
+def _fitted(problem: Problem, trajectory: Trajectory, limits: MotionLimits, smoothness: float) -> SmoothMotion:
     """The plan's positions and headings by splines, as they are timed."""
     poses = np.concatenate([trajectory.positions, problem.team.headings(trajectory.states)[..., None]], axis=2)
     moving = np.any(poses[1:] != poses[:-1], axis=(1, 2))
@@ -289,4 +283,4 @@ def _fitted(problem: Problem, trajectory: Trajectory, smoothness: float) -> Smoo
             curvatures.c[:, group] = steered.c
     offset = curves(np.linspace(0, (last - first) * problem.dt, len(rows))) - positions
     deviation = float(np.linalg.norm(offset, axis=2).max())
-    return SmoothMotion(problem, curves, turns, curvatures, deviation)
+    return SmoothMotion(problem, limits, curves, turns, curvatures, deviation)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.polynomial.polynomial import polyder, polyval
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import PPoly, make_interp_spline
 
 from d4orm_env import Problem, Team, World, make_problem, verify
 from d4orm_env.engine.choice import get_engine
@@ -331,7 +331,7 @@ def test_polynomials_are_close_to_the_motion(plans: dict[str, Plan], name: str, 
         table = np.array(lines, float)
         ends = np.cumsum(table[:, 0])
         assert ends[-1] == pytest.approx(report.duration, abs=1e-6)
-        for i, time in enumerate(s.time[:-1:20]):
+        for i, time in enumerate(s.time[:-1:20] * report.stretch / s.stretch):
             piece = int(np.searchsorted(ends, time, side="right"))
             own = time - (ends[piece] - table[piece, 0])
             x, y, z, yaw = (polyval(own, table[piece, 1 + 8 * k : 9 + 8 * k]) for k in range(4))
@@ -345,6 +345,26 @@ def test_polynomials_are_close_to_the_motion(plans: dict[str, Plan], name: str, 
             speed = polyval(before[0], polyder(before[1:9]))
             assert end == pytest.approx(after[1], abs=1e-5)
             assert speed == pytest.approx(after[2], abs=1e-4)
+
+
+@pytest.mark.parametrize(("name", "most"), [("space", MOST_PIECES), ("plane", 4), ("wheels", 6)])
+def test_polynomials_keep_the_limits_however_few_there_are(
+    plans: dict[str, Plan], name: str, most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("d4orm_planners.tracking.export.MOST_PIECES", most)
+    plan, team, flat = plans[name], plans[name].problem.team, plans[name].problem.dimension == 2
+    report = plan.export("crazyswarm2", tmp_path, height=float(flat))
+    assert report.deviation > plan.sample(100).deviation
+    for robot, path in enumerate(report.files):
+        table = np.loadtxt(path, delimiter=",", skiprows=1)
+        ends = np.concatenate([[0.0], np.cumsum(table[:, 0])])
+        way = PPoly(table[:, 1:].reshape(-1, 4, 8)[:, : 2 + (not flat)].transpose(2, 0, 1)[::-1], ends)
+        times = np.linspace(0, ends[-1], 2000)
+        for order, limit in ((1, team.max_speed[robot]), (2, team.max_acceleration[robot])):
+            # Those on wheels turn in curves, which takes no acceleration of their model.
+            if order == 1 or name != "wheels":
+                assert np.linalg.norm(way(times, order), axis=1).max() <= limit
+    assert report.duration == pytest.approx(ends[-1], abs=1e-6)
 
 
 def test_a_bag_is_read_by_its_database(plans: dict[str, Plan], tmp_path: Path) -> None:
