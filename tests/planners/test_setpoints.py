@@ -13,7 +13,7 @@ import pytest
 from numpy.polynomial.polynomial import polyder, polyval
 from scipy.interpolate import PPoly, make_interp_spline
 
-from d4orm_env import Problem, Team, World, make_problem, verify
+from d4orm_env import Problem, Team, World, make_problem, rollout, verify
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.footprints import Box, Train
 from d4orm_env.verify.curves import verify_curves
@@ -68,6 +68,26 @@ def test_setpoints_are_derivatives_within_the_limits(plans: dict[str, Plan], nam
         assert (np.linalg.norm(s.acceleration, axis=2) <= problem.team.max_acceleration * (1 + 1e-6)).all()
     turning = np.abs(np.diff(s.heading, axis=0)).max() * 500
     assert turning <= problem.team.max_turn_rate.max() * (1 + 1e-3)
+
+
+@pytest.mark.parametrize("name", ["plane", "slow goals", "space", "walls"])
+def test_mean_accelerations_lead_from_sample_to_sample_and_are_a_plan_without_a_clip(
+    plans: dict[str, Plan], name: str
+) -> None:
+    problem, dt = plans[name].problem, plans[name].problem.dt
+    s = plans[name].sample(rate=1 / dt)
+    controls = np.diff(s.velocity, axis=0) / dt
+    close = problem.team.max_acceleration[0] * dt**2 / 12
+    velocity = s.velocity[0] + np.concatenate([0 * controls[:1], np.cumsum(dt * controls, axis=0)])
+    position = s.position[0] + np.cumsum(dt * velocity[:-1] + dt**2 / 2 * controls, axis=0)
+    np.testing.assert_allclose(position, s.position[1:], atol=1.01 * close)
+    problem = problem.replace(horizon=len(controls))
+    report, executed = verify(problem, controls), rollout(problem, controls)
+    assert report.ok
+    under_way = ~executed.arrived[1:]
+    speeds = executed.states[1:, :, problem.dimension : 2 * problem.dimension]
+    np.testing.assert_allclose(speeds[under_way], s.velocity[1:][under_way], atol=1e-5)
+    np.testing.assert_allclose(executed.positions[1:][under_way], position[under_way], atol=1e-4)
 
 
 @pytest.mark.parametrize("name", CASES)
