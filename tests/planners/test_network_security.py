@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from network_support import free_endpoint, has_listeners, port_of, wait_until
@@ -16,7 +17,8 @@ from network_support import free_endpoint, has_listeners, port_of, wait_until
 from d4orm_planners.cli.node_command import load_node
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
 
-NODE = Path(__file__).resolve().parents[2] / "examples" / "node"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+NODE = EXAMPLES / "node"
 
 pytestmark = [
     pytest.mark.slow,
@@ -95,6 +97,35 @@ def test_a_stranger_neither_hears_nor_is_heard(
         assert first.collect() == []
     finally:
         outside.close()
+
+
+@pytest.mark.parametrize("who", ["tb0", "operator", "guest"])
+def test_robots_tell_states_and_operators_give_orders(who: str, tmp_path: Path) -> None:
+    from d4orm_planners.serve import wire
+    from d4orm_planners.tracking import ros_messages as ros
+
+    names = [f"{name}=127.0.0.1" for name in ("server", who)]
+    subprocess.run(["bash", str(NODE / "certificates.sh"), str(tmp_path), *names], check=True, capture_output=True)
+    text = (EXAMPLES / "robots" / "zenoh.json5").read_text().replace("/etc/d4orm/ca.pem", str(tmp_path / "ca.pem"))
+    (tmp_path / "server.json5").write_text(text.replace("/etc/d4orm", str(tmp_path / "server")))
+    transport = text[: text.index("  // Robots say")] + "}"
+    (tmp_path / "who.json5").write_text(transport.replace("/etc/d4orm", str(tmp_path / who)))
+    endpoint, topics = free_endpoint().replace("tcp", "tls"), {"tb0/pose": "tb0", "tb0/goal": "operator"}
+    ours = ZenohSettings(listen=(endpoint,), config_file=str(tmp_path / "server.json5"))
+    theirs = ZenohSettings(listen=(), connect=(endpoint,), config_file=str(tmp_path / "who.json5"))
+    with wire.RosSession(ours, 0, "d4orm") as server, wire.RosSession(theirs, 0, "other") as other:
+        heard = {topic: server.subscriber(topic, wire.POSE) for topic in topics}
+        said = {topic: other.publisher(topic, wire.POSE) for topic in topics}
+        command, commanded = server.publisher("tb0/cmd_vel", wire.TWIST), other.subscriber("tb0/cmd_vel", wire.TWIST)
+        seen, may, end = set(), {topic for topic, name in topics.items() if name == who}, time.perf_counter() + 30
+        while time.perf_counter() < end and not (who != "guest" and seen == may | {"cmd_vel"}):
+            end = min(end, time.perf_counter() + 2) if who == "guest" else end
+            for publisher in said.values():
+                publisher.publish(ros.make(wire.POSE, ros.header(0), ros.pose(np.zeros(2), 0.0)))
+            command.publish(ros.twist(np.zeros(3)))
+            time.sleep(0.05)
+            seen |= {topic for topic in topics if heard[topic].take()} | ({"cmd_vel"} if commanded.take() else set())
+    assert seen == (may | {"cmd_vel"} if who != "guest" else set())
 
 
 def test_the_documented_file_of_a_node_is_a_good_one(tmp_path: Path) -> None:
