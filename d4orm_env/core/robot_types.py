@@ -15,6 +15,7 @@ from d4orm_env.footprints import Ellipsoid
 _CRAZYFLIE = "https://www.bitcraze.io/documentation/hardware/crazyflie_2_1/crazyflie_2_1-datasheet.pdf"
 _BRUSHLESS = "https://www.bitcraze.io/author/tobias/"
 _ROBOTIS = "https://emanual.robotis.com/docs/en/platform/turtlebot3/features/#specifications"
+_BURGER = "https://github.com/ROBOTIS-GIT/turtlebot3, turtlebot3_description/urdf/turtlebot3_burger.urdf"
 _DJI = "https://www.dji.com/robomaster-ep/specs"
 _CLEARPATH = "https://github.com/jackal/jackal/blob/noetic-devel/jackal_control/config/control.yaml"
 _FLOWN = "ours, measured in crazyflow 0.4.0 (examples.studies zero_shot): "
@@ -76,16 +77,16 @@ ROBOTS: Mapping[str, RobotType] = MappingProxyType({
     ),
     "turtlebot3_burger": _robot(
         "differential_drive",
-        radius=(0.105, f"robot_radius of turtlebot3_navigation2; 138 x 178 mm, {_ROBOTIS}"),
+        radius=(0.124, f"from between the wheels to the corners of its box, 140 mm square and 32 mm behind, {_BURGER}"),
         max_speed=(0.22, _ROBOTIS),
-        max_acceleration=(0.5, "ours; turtlebot3_navigation allows 2.5"),
+        max_acceleration=(0.5, "ours; 2.5 at most, dwa_local_planner_params_burger.yaml of turtlebot3_navigation"),
         max_turn_rate=(1.8, f"ours; 2.84 rad/s at most, {_ROBOTIS}"),
         margin=(0.05, _GUESSED),
         lag=(0.15, "ours, not measured: a loop at 10 Hz over ROS 2"),
     ),
     "robomaster": _robot(
         "holonomic2d",
-        radius=(0.2, f"half of the diagonal of 320 x 240 mm, {_DJI}"),
+        radius=(0.2, f"half of the diagonal of 320 x 240 mm, {_DJI}; with an arm it is 410 mm long, 0.24"),
         max_speed=(1.0, f"ours; 3.5 m/s forwards and 2.8 m/s sideways at most, {_DJI}"),
         max_acceleration=(1.0, "ours, for mecanum wheels without slip, not measured"),
         margin=(0.05, _GUESSED),
@@ -95,7 +96,7 @@ ROBOTS: Mapping[str, RobotType] = MappingProxyType({
         "differential_drive",
         radius=(0.333, "half of the diagonal of 508 x 430 mm, Clearpath's figures as others quote them"),
         max_speed=(1.5, f"ours; 2.0 m/s at most, {_CLEARPATH}"),
-        max_acceleration=(1.0, "ours, for skid steering, not measured"),
+        max_acceleration=(1.0, f"ours, for skid steering, not measured; 20 at most, {_CLEARPATH}"),
         max_turn_rate=(1.5, f"ours; 4.0 rad/s at most, {_CLEARPATH}"),
         margin=(0.1, _GUESSED),
         lag=(0.2, _GUESSED),

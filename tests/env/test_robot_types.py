@@ -29,7 +29,7 @@ def test_a_team_of_robots_by_name(name: str) -> None:
     [
         ("crazyflie", 0.07),
         ("crazyflie_brushless", 0.08),
-        ("turtlebot3_burger", 0.105),
+        ("turtlebot3_burger", np.hypot(0.07 + 0.032, 0.07)),
         ("robomaster", np.hypot(0.32, 0.24) / 2),
         ("jackal", np.hypot(0.508, 0.43) / 2),
     ],
