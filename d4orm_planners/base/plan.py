@@ -71,7 +71,8 @@ class Plan(DisplayMixin):
         planner: Name of the planner.
         problem: The problem.
         seed: The seed.
-        controls: ``(H, K, m)`` inside the limits, zero after arrival.
+        controls: ``(H, K, m)`` inside the limits, zero after arrival. Not what speeds change by where the model limits
+            these: robots get :meth:`sample`.
         solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` found no fault.
         status: End of the search. ``"solved"``: with a solution. ``"iteration_limit"`` or ``"time_limit"``: with the
             budget, so without a solution unless it was to be improved. ``"stopped"`` (by the callback) or
