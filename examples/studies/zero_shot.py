@@ -21,6 +21,7 @@ from examples.denoising import denoising_columns, denoising_of
 
 from d4orm_env import Problem, make_problem
 from d4orm_planners import Controller, Plan, make_planner
+from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 
 ROBOT, RATE, FIRST_SEED = "crazyflie", 100, 1000
 DISTURBED = {"gust": 0.02, "mass_factor": 1.05}
@@ -92,11 +93,13 @@ def fly(scenario: str, condition: str, seed: int) -> dict[str, Any]:
     problem, mode = problem_of(scenario, seed), condition.partition(",")[0]
     bodies = DroneBodies(problem, np.zeros(0, np.float32), DronePhysics(**CONDITIONS[condition]))
     bodies.begin(seed)
-    denoising: dict[str, float | None] = dict.fromkeys(denoising_of([]))  # not told of a controller
+    denoising: dict[str, float | None] = dict.fromkeys(denoising_of([]))
+    loop_steps = None  # of a controller, whose time is not told
     if mode == "open loop":
         plan = make_planner().solve(problem, seed=seed, time_limit=60)
         steps, denoising = fly_plan(problem, plan, bodies), denoising_of(plan.history)
     else:
+        loop_steps = D4ormC2FConfig().num_steps
         steps = fly_controller(problem, seed, bodies, mode)
     touched, arrived = np.zeros((2, problem.num_robots), np.bool_)
     for touching in steps:
@@ -112,6 +115,7 @@ def fly(scenario: str, condition: str, seed: int) -> dict[str, Any]:
         "mean_squared_error": float(record.mean_squared_error.mean()), "error": float(record.largest_error.max()),
         "gap": float(record.least_gap.min()), "clearance": float(record.least_clearance.min()),
         "radius": float(problem.team.radius[0]), "seconds": record.samples / RATE, **denoising,
+        "loop_steps": loop_steps,
     }  # fmt: skip
 
 
@@ -129,9 +133,12 @@ def row_of(scenario: str, condition: str, rows: Sequence[dict[str, Any]]) -> dic
     """The table's row of some flights."""
     flown = [row for row in rows if row["flown"]]
     drones = sum(row["robots"] for row in flown)
+    told, loop_steps = denoising_columns(rows), rows[0]["loop_steps"]
+    if loop_steps:
+        told["denoising steps"] = f"{loop_steps} a loop"
     rms = np.sqrt(np.mean([row["mean_squared_error"] for row in flown]))
     return {
-        "scenario": scenario, "flown": condition, **denoising_columns(rows), "teams": f"{len(flown)} of {len(rows)}",
+        "scenario": scenario, "flown": condition, **told, "teams": f"{len(flown)} of {len(rows)}",
         "arrived": f"{sum(row['arrived'] for row in flown)} of {drones}",
         "in contact": sum(row["contacts"] for row in flown), "fallen": sum(row["fallen"] for row in flown),
         "error RMS [m]": f"{rms:.3f}",
