@@ -131,11 +131,11 @@ def rows_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
     rows = []
     for (method, config), group in groups.items():
         settings = json.loads(config)
-        steps = float(np.mean([penalised_steps(trial) for trial in group]))
+        steps, restricted = (float(np.mean([penalised_steps(trial, factor) for trial in group])) for factor in (2, 1))
         solved = sum(map(is_solved, group))
         rows.append(
             {"method": method, "trials": len(group), "solved": solved, "steps": round(steps, 1),
-             "settings": described(method, settings)}
+             "restricted": round(restricted, 1), "settings": described(method, settings)}
         )  # fmt: skip
     order = list(SPACES)
     return sorted(rows, key=lambda row: (order.index(row["method"]), -row["trials"], row["steps"], row["settings"]))

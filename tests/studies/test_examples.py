@@ -357,6 +357,16 @@ def test_algorithm_4_has_one_thing_changed_at_a_time(tmp_path: Path) -> None:
     check_made_again("algorithm_4_parts", tmp_path, rows)
 
 
+def test_controllers_tell_what_share_of_the_time_they_denoise(tmp_path: Path) -> None:
+    completed("controller_denoising", tmp_path)
+    rows = {row["controller"]: row for row in table(tmp_path / "controller_denoising.csv")}
+    assert set(rows) == {"d4orm-c2f", "d4orm-c2f, ours"}
+    for row in rows.values():
+        assert row["loop, denoising steps"] == "5"
+        assert int(row["coarse plan, denoising steps"]) > 0
+        assert all(0 < int(row[name].rstrip("%")) <= 100 for name in row if name.startswith("denoising, time"))
+
+
 def test_a_controller_that_forgets_begins_every_window_with_no_controls() -> None:
     begun: list[float] = []
 
