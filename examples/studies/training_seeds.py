@@ -87,14 +87,12 @@ def summary(rows: Rows) -> list[dict[str, object]]:
         steps = max(row["steps"] for row in every)
         last = [row for row in every if row["steps"] == steps]
         ends = [100 * row["success"] for row in last]
-        minutes = sum(row["seconds"] for row in every) / len(last) / 60
         row = {
             "learner": learner,
             "seeds": len(last),
             "robot-steps": f"{steps / 1e6:.1f} million",
             **success_of_seeds(ends, "success in the end"),
             "travel time [s]": f"{np.mean([one['travel_time'] for one in last]):.2f}",
-            "minutes each": f"{minutes:.0f}",
             "environment's share": f"{np.mean([one['env_share'] for one in every]):.0%}",
         }
         table.append(row)
