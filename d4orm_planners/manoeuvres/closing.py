@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import BoolArray, Floats
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import Model, TimeStep
@@ -61,14 +61,15 @@ class GapSpace(NamedTuple):
         )  # fmt: skip
 
 
-def ends_of(problem: Problem, number: int, goal: Goal) -> Ends:
-    """Data of a robot of a team: it is to end at its goal, at rest."""
+def ends_of(problem: Problem, number: int, goal: Goal, last: Floats | FloatArray) -> Ends:
+    """Data of a robot of a team: it is to end at its goal at rest, its trailers as asked or as in the ``last`` pose."""
     model, limits = problem.team.robot_models[number], problem.team.limits[number].astype(np.float64)
     n, turned = model.state_size, [] if model.heading_index is None else [(model.heading_index, goal.heading)]
     wanted, tolerance, angles = np.zeros(n), np.full(n, np.inf), np.zeros(n, np.bool_)
     wanted[:2], tolerance[:2] = (goal.x, goal.y), EXACT * goal.radius
-    hitches = zip([hitch for hitch, _ in model.trailers], goal.hitches, strict=False)
-    for angle, value in (*turned, *hitches):
+    asked = np.array(goal.hitches)
+    hitches = np.where(np.isnan(asked), last[3:], asked).tolist()
+    for angle, value in (*turned, *zip([hitch for hitch, _ in model.trailers], hitches, strict=False)):
         if not np.isnan(value):
             wanted[angle], tolerance[angle] = value, EXACT * goal.tolerance
     # What is left of its speed must not lead it away from there.

@@ -165,7 +165,7 @@ def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:
     primitives, _, modes = primitives_of(kind)
     if kind.start not in modes:
         return None
-    start, goal, last = np.zeros(POSE_SIZE), _goal(problem, number), _limits(kind)
+    start, goal, last = np.zeros(POSE_SIZE), make_goal(problem, number), _limits(kind)
     start[: _extra(model)] = state[: _extra(model)]
     start[3 : 3 + len(model.trailers)] = state[3 : 3 + len(model.trailers)]
     lattice = area.lattice(kind, float(start[2]), start, goal, len(modes))
@@ -192,7 +192,8 @@ def _limits(kind: Kind) -> Limits:
     )  # fmt: skip
 
 
-def _goal(problem: Problem, number: int) -> Goal:
+def make_goal(problem: Problem, number: int) -> Goal:
+    """A robot's goal."""
     heading = np.nan if problem.team.robot_models[number].heading_index is None else problem.goal_heading[number]
     return Goal(
         float(problem.goal[number, 0]), float(problem.goal[number, 1]), float(heading),

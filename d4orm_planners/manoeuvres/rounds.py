@@ -8,14 +8,16 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.footprints import Box
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.manoeuvres.closing import gap_closer
+from d4orm_planners.manoeuvres.closing import GapSpace, ends_of, gap_closer
 from d4orm_planners.manoeuvres.curves import NO_CURVES
 from d4orm_planners.manoeuvres.nodes import AHEAD
+from d4orm_planners.manoeuvres.primitives import POSE_SIZE
+from d4orm_planners.manoeuvres.robots import make_goal
 from d4orm_planners.manoeuvres.search import curve_from, find_motion
-from d4orm_planners.manoeuvres.shortening import SHORTENED
 from d4orm_planners.manoeuvres.team import TeamMotions
 from d4orm_planners.mapf.lns import search_neighbourhoods
 
@@ -27,21 +29,25 @@ BETTER_ROUNDS = 16
 
 
 def compile_manoeuvres(models: tuple[str, ...]) -> None:
-    """Compile what such a team needs, if it is not yet: the search is the same for all models."""
-    names = sorted({*models} & {*SHORTENED})
-    if find_motion.signatures and all(gap_closer(name).signatures for name in names):
-        return
-    world = World(boxes=[[0.5, 0.8, 0.6, 1.2]])
-    for name in names or ["unicycle"]:
-        team = Team((name,) * 2, footprint=Box(0.4, 0.2))
-        start = np.zeros((2, team.state_size))
-        start[:, 1:3] = [[0.0, 1.0], [2.0, 1.0]]
-        problem = Problem(team, start, [[1.0, 0.0], [1.0, 2.0]], world, goal_heading=0.0)
-        motions = TeamMotions.prepared(problem, lambda: False)
-        assert motions is not None
-        motions.plan_all()
-        motions.shorten([0], np.random.default_rng(0))
-        curve_from(NO_CURVES, motions.robots[0].task.goal, 0.0, 0.0, 0.0, AHEAD)
+    """Compile what such a team needs, if it is not yet: all but the gap closer is the same for all models."""
+    if not find_motion.signatures:
+        _compile_search()
+    for model in (MODELS[name] for name in sorted({*models}) if not gap_closer(name).signatures):
+        n, m = model.state_size, model.control_size
+        problem = Problem(Team((model.name,)), np.zeros((1, n)), [[1.0, 0.0]])
+        ends = ends_of(problem, 0, make_goal(problem, 0), np.zeros(POSE_SIZE))
+        gap_closer(model.name)(ends, np.zeros((1, m)), 0, GapSpace.of(1, n, m))
+
+
+def _compile_search() -> None:
+    start = np.array([[0.0, 0.0, 1.0], [0.0, 2.0, 1.0]])
+    team, world = Team(("unicycle",) * 2, footprint=Box(0.4, 0.2)), World(boxes=[[0.5, 0.8, 0.6, 1.2]])
+    problem = Problem(team, start, [[1.0, 0.0], [1.0, 2.0]], world, goal_heading=0.0)
+    motions = TeamMotions.prepared(problem, lambda: False)
+    assert motions is not None
+    motions.plan_all()
+    motions.shorten([0], np.random.default_rng(0))
+    curve_from(NO_CURVES, motions.robots[0].task.goal, 0.0, 0.0, 0.0, AHEAD)
 
 
 def find_manoeuvres(search: SolveRun) -> TeamMotions | None:

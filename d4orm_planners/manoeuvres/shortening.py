@@ -20,8 +20,6 @@ from d4orm_planners.manoeuvres.robots import Robot
 from d4orm_planners.manoeuvres.search import Motion
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meeting, safe_until
 
-SHORTENED = ("unicycle2",)
-"""Models whose motions are shortened: those that speed up and turn at the same time, as no move of the search does."""
 SHARE, TRIES, FAILURES = 1 / 8, 30, 6
 """Share of the steps that is left out at first, half as many after each failure and twice as many after a success;
 and tries in all, and of single steps in a row that fail, after which a motion is short enough."""

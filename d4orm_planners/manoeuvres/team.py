@@ -20,7 +20,7 @@ from d4orm_planners.manoeuvres.nodes import Nodes
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 from d4orm_planners.manoeuvres.robots import ManoeuvreScene, Robot, make_robot, scene_of
 from d4orm_planners.manoeuvres.search import PAUSED, Motion, find_motion, motion_to
-from d4orm_planners.manoeuvres.shortening import SHORTENED, shortened
+from d4orm_planners.manoeuvres.shortening import shortened
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meets_nobody, traffic_of
 from d4orm_planners.mapf.lns import Odds
 from d4orm_planners.tracking.steering import advanced
@@ -193,10 +193,10 @@ class TeamMotions:
         """Shorten the motions of some robots, one after the other, each among those of all others."""
         for robot in robots:
             own, motion, others = self.robots[robot], self.motions[robot], [*range(len(self.robots))]
-            if motion is None or own.model.name not in SHORTENED or self.should_stop():
+            if motion is None or self.should_stop():
                 continue
             others.remove(robot)
-            start, ends = self.problem.start[robot], ends_of(self.problem, robot, own.task.goal)
+            start, ends = self.problem.start[robot], ends_of(self.problem, robot, own.task.goal, motion.poses[-1])
             traffic = self._traffic(others, {})
             self._take(robot, shortened(own, start, ends, motion, traffic, self._nodes, random))
 

@@ -73,18 +73,22 @@ def test_one_of_two_that_change_places_beside_a_bay_goes_into_it(model: str) -> 
     assert plan.trajectory.positions[..., 0].max() > 1.95
 
 
-def test_second_order_unicycles_that_change_places_turn_as_they_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("model", "share"), [("unicycle2", 0.75), ("unicycle", 0.9), slow("car", 0.6), ("car_with_1_trailer", 0.9)]
+)
+def test_robots_that_change_places_turn_as_they_drive(
+    model: str, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The moves of a search turn, drive or stand: joined to a motion they take much longer than what is left of it."""
-    limits = {"max_speed": 0.5, "max_acceleration": 0.25, "max_turn_rate": 0.5}
-    own = {"max_turn_acceleration": 0.25}
-    team = Team(("unicycle2",) * 3, footprint=Box(0.5, 0.25), own_limits=own, **limits)
-    start = np.zeros((3, 5))
+    front = Box(0.5, 0.25)
+    team = Team((model,) * 3, footprint=Train(front, [Box(0.3, 0.25)]) if "trailer" in model else front)
+    start = np.zeros((3, team.state_size))
     start[:, :3] = [[1.0, 1.0, 0.5], [4.0, 1.0, 2.5], [2.5, 3.0, 0.0]]
     goal = start[[1, 0, 2], :2]  # the last one is there
     problem = Problem(team, start, goal, goal_heading=start[:, 2], margin=0.02, horizon=400, arrival="stay")
     plan = make_planner(engine="cpu").solve(problem, seed=0)
     assert plan.verified
     assert (plan.iterations, plan.denoising_steps) == (1, 0)
-    monkeypatch.setattr(team_motions, "SHORTENED", ())
+    monkeypatch.setattr(TeamMotions, "shorten", lambda *arguments: None)
     joined = make_planner(engine="cpu").solve(problem, seed=0)
-    assert plan.metrics["travel_time"] < 0.7 * joined.metrics["travel_time"]
+    assert plan.metrics["travel_time"] < share * joined.metrics["travel_time"]
