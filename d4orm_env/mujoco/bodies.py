@@ -14,7 +14,8 @@ from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.winding import unwound
-from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TimeStep
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE, TimeStep
+from d4orm_env.dynamics.unicycle2 import MAX_TURN_ACCELERATION, UNICYCLE2
 from d4orm_env.envs.body_simulation import Moved, Robots
 from d4orm_env.mujoco.scene import (
     DRIVES,
@@ -31,6 +32,8 @@ from d4orm_env.mujoco.scene import (
 _HELD = 1e6
 """Weight added to a docked robot, per degree of freedom [kg]: nothing moves it."""
 _SPIN, _FREE_DOFS, _FREE_POSITIONS = 2, 6, 7
+TURNING = 4
+"""State component of second-order unicycles that is their turn rate."""
 
 
 class TeamBodies:
@@ -57,7 +60,7 @@ class TeamBodies:
         self._servo_dofs = dofs[self._servos][:, None] + np.arange(2)
         self._wheel_dofs = dofs[self._drives][:, None] + _FREE_DOFS + np.arange(2)
         self._headings: Floats = np.zeros(problem.num_robots)
-        self._wanted: Floats = np.zeros(problem.num_robots)
+        self._wanted: Floats = np.zeros((problem.num_robots, 2))
         self._held: BoolArray = np.zeros(problem.num_robots, np.bool_)
 
     def begin(self, seed: int) -> None:
@@ -117,6 +120,8 @@ class TeamBodies:
                 velocity = qvel[dof] * math.cos(heading) + qvel[dof + 1] * math.sin(heading)
             if model.speed_indices:
                 states[robot, list(model.speed_indices)] = velocity
+            if model.name == UNICYCLE2.name:
+                states[robot, TURNING] = qvel[dof + _FREE_DOFS - 1]
         return states
 
     def _put(self, robot: int, state: Floats) -> None:
@@ -133,9 +138,13 @@ class TeamBodies:
         self._headings[robot] = heading = state[model.heading_index]
         data.qpos[joint + 2 : joint + _FREE_POSITIONS] = [0, math.cos(heading / 2), 0, 0, math.sin(heading / 2)]
         data.qpos[joint + _FREE_POSITIONS : joint + _FREE_POSITIONS + 2] = 0
-        self._wanted[robot] = speed = float(sum(state[index] for index in model.speed_indices))
+        speed = float(sum(state[index] for index in model.speed_indices))
+        turning = float(state[TURNING]) if model.name == UNICYCLE2.name else 0.0
+        self._wanted[robot] = speed, turning
         data.qvel[dof : dof + 2] = speed * math.cos(heading), speed * math.sin(heading)
-        data.qvel[dof + _FREE_DOFS : dof + _FREE_DOFS + 2] = speed / (WHEEL_RADIUS * float(self.scene.radius[robot]))
+        data.qvel[dof + _FREE_DOFS - 1] = turning
+        sides = speed + turning * HALF_TRACK * float(self.scene.radius[robot]) * np.array([-1.0, 1.0])
+        data.qvel[dof + _FREE_DOFS : dof + _FREE_DOFS + 2] = sides / (WHEEL_RADIUS * float(self.scene.radius[robot]))
 
     def _dofs(self, robot: int) -> slice:
         first = int(self.scene.dofs[robot])
@@ -181,24 +190,32 @@ class TeamBodies:
         self.data.qfrc_applied[self._wheel_dofs] = torque
 
     def _commands(self, controls: FloatArray, states: FloatArray, limits: FloatArray) -> WheelCommands:
-        """Return the drives' commands: a turn rate, and a speed, or an acceleration from the speed wanted last."""
+        """Return the drives' commands: a turn rate and a speed, or their changes from those wanted last."""
         rows = []
         for robot in self._drives.tolist():
             first, second = controls[robot, :2].tolist()
-            model = self.problem.team.robot_models[robot]
-            most, reverse = float(limits[robot, SPEED]), float(model.lower_bounds(limits[robot])[SPEED])
-            speeds = states[robot, list(model.speed_indices)].tolist()
+            model, own = self.problem.team.robot_models[robot], limits[robot]
+            lower, speeds = model.lower_bounds(own), states[robot, list(model.speed_indices)].tolist()
+            allowed, turns = ((-float(lower[limit]), float(own[limit])) for limit in (SPEED, TURN_RATE))
             if not speeds:
-                rows.append((first, 0.0, second, -reverse, most))
+                rows.append((first, 0.0, *allowed, second, 0.0, *turns))
                 continue
-            # From the speed that it was to have, which it nearly has unless something holds it up.
-            behind = self._wanted[robot] - speeds[0]
-            change = float(limits[robot, ACCELERATION]) * self.problem.dt
-            begin = speeds[0] + min(max(behind, -change), change)
-            end = begin + self.problem.dt * second
-            self._wanted[robot] = min(max(end, -reverse), most)
-            rows.append((begin, second, first, -reverse, most))
-        return WheelCommands(*np.array(rows, np.float64).reshape(-1, 5).T)
+            push, turn, swing = second, first, 0.0
+            if model.name == UNICYCLE2.name:
+                push, swing, now = first, second, float(states[robot, TURNING])
+                turn = self._onward(robot, 1, now, swing, float(own[MAX_TURN_ACCELERATION]), turns)
+            speed = self._onward(robot, 0, speeds[0], push, float(own[ACCELERATION]), allowed)
+            rows.append((speed, push, *allowed, turn, swing, *turns))
+        return WheelCommands(*np.array(rows, np.float64).reshape(-1, 8).T)
+
+    def _onward(
+        self, robot: int, which: int, now: float, change: float, most: float, limits: tuple[float, float]
+    ) -> float:
+        """A speed or turn rate from which it changes on: what it was to be, which it nearly is unless it is held up."""
+        most *= self.problem.dt
+        begin = now + min(max(float(self._wanted[robot, which]) - now, -most), most)
+        self._wanted[robot, which] = min(max(begin + self.problem.dt * change, limits[0]), limits[1])
+        return begin
 
     def _note_contacts(self, touched: BoolArray) -> None:
         contact = self.data.contact
@@ -212,9 +229,12 @@ class WheelCommands(NamedTuple):
 
     speed: Floats  #: At the beginning [m/s]
     acceleration: Floats  #: From there on [m/s^2]
-    turn_rate: Floats  #: [rad/s]
     least: Floats  #: Speed backwards at most, negative [m/s]
     most: Floats  #: Speed forwards at most [m/s]
+    turn_rate: Floats  #: At the beginning [rad/s]
+    turn_acceleration: Floats  #: From there on [rad/s^2]
+    least_turn: Floats  #: Turn rate to the right at most, negative [rad/s]
+    most_turn: Floats  #: The same to the left [rad/s]
 
 
 class WheelControl:
@@ -258,7 +278,8 @@ class WheelControl:
         """
         wanted = commands.speed + time * commands.acceleration
         speed = np.clip(wanted, commands.least, commands.most)
-        turning = commands.turn_rate * self._half_track
+        turn_rate = commands.turn_rate + time * commands.turn_acceleration
+        turning = np.clip(turn_rate, commands.least_turn, commands.most_turn) * self._half_track
         reference = np.stack([speed - turning, speed + turning], axis=1) / self.radius[:, None]
         ahead = np.where(speed == wanted, commands.acceleration, 0.0) / self.radius
         error = reference - spin

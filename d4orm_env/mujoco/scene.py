@@ -48,7 +48,7 @@ class Physics:
 
 GRAVITY = 9.81
 """[m/s^2]."""
-PUCKS, DRIVES = ("holonomic2d", "velocity2d"), ("differential_drive", "unicycle")
+PUCKS, DRIVES = ("holonomic2d", "velocity2d"), ("differential_drive", "unicycle", "unicycle1", "unicycle2")
 """Models of robots that are pushed, and of those on two wheels."""
 
 WHEEL_RADIUS, HALF_TRACK, WHEEL_HALF_WIDTH, CASTER_RADIUS, CASTER_POSITION = 0.3, 0.65, 0.08, 0.1, 0.75

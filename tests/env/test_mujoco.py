@@ -27,7 +27,7 @@ from d4orm_env.mujoco.bodies import TeamBodies
 from d4orm_planners import run_episode
 from d4orm_planners.base.episode import open_env
 
-MODELS = ("holonomic2d", "velocity2d", "differential_drive", "unicycle")
+MODELS = ("holonomic2d", "velocity2d", "differential_drive", "unicycle", "unicycle1", "unicycle2")
 CLUTTER = World(
     circles=[[2, 3, 0.4]],
     boxes=[[2, -3, 3, -2]],
@@ -136,6 +136,16 @@ def test_a_drive_turns_on_the_spot() -> None:
     assert (x, y, speed) == pytest.approx((0, 0, 0), abs=5e-3)
 
 
+def test_a_second_order_unicycle_turns_faster_up_to_its_limits() -> None:
+    problem = Problem(Team(("unicycle2",), own_limits={"max_right_turn_rate": 0.8}), [[0] * 5], [[5, 5]])
+    env = mujoco.parallel_env(problem=problem)
+    env.reset(seed=0)
+    x, y, heading, speed, turn_rate = driven(env, [0.0, 0.5], 10)
+    assert (heading, turn_rate) == pytest.approx((0.25, 0.5), abs=0.03)
+    assert (x, y, speed) == pytest.approx((0, 0, 0), abs=5e-3)
+    assert driven(env, [0.0, -1.0], 20)[4] == pytest.approx(-0.8, abs=0.03)
+
+
 def test_headings_wind_up() -> None:
     assert driven(alone("unicycle", [0, 0, 0]), [0.0, -1.5], 80)[2] == pytest.approx(-12.0, abs=0.2)
 
@@ -209,8 +219,7 @@ def test_robots_bump_into_each_other_and_it_counts_whenever_it_was() -> None:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_who_has_docked_is_at_rest_and_cannot_be_pushed_away(model: str) -> None:
-    size = {"holonomic2d": 4, "velocity2d": 2, "differential_drive": 4, "unicycle": 3}[model]
-    start = np.zeros((2, size))
+    start = np.zeros((2, Team((model,)).state_size))
     start[1, 0] = -1.0
     problem = Problem(Team((model,) * 2), start, [[0.05, 0], [3, 3]], horizon=60)
     env = mujoco.parallel_env(problem=problem)
@@ -231,9 +240,9 @@ def test_who_has_docked_is_at_rest_and_cannot_be_pushed_away(model: str) -> None
 
 @pytest.mark.parametrize("model", MODELS)
 def test_bodies_are_where_they_are_put(model: str) -> None:
-    env = alone(model, [0.0] * {"velocity2d": 2, "unicycle": 3}.get(model, 4))
+    env = alone(model, [0.0] * Team((model,)).state_size)
     env.step({"robot_0": np.ones(2, np.float32)})
-    state = np.array([[1.0, -2.0, 0.5, 0.25]], np.float32)[:, : env.problem.state_size]
+    state = np.array([[1.0, -2.0, 0.5, 0.25, 0.5]], np.float32)[:, : env.problem.state_size]
     env.set_state(state)
     assert env.problem.state_size == state.shape[1]
     assert np.allclose(env._simulation.bodies.states(), state, atol=1e-6)
