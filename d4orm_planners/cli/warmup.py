@@ -18,7 +18,7 @@ from d4orm_env.dynamics.models import COMMON
 from d4orm_env.engine.caching import Kernel, check_can_be_kept, has_to_be_compiled
 from d4orm_env.engine.cpu import world_kernels
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners import d4orm_c2f, mapf, tracking
+from d4orm_planners import d4orm_c2f, manoeuvres, mapf, tracking
 from d4orm_planners import engine as sampling_engine
 from d4orm_planners.base.names import PLANNERS
 from d4orm_planners.base.planner_registry import make_planner
@@ -26,12 +26,17 @@ from d4orm_planners.cli.options import Quiet
 from d4orm_planners.d4orm_c2f.barrier import safe_velocities
 from d4orm_planners.engine.score import score_kernel
 from d4orm_planners.hybrid import compile_ahead
+from d4orm_planners.manoeuvres.closing import gap_closer
+from d4orm_planners.manoeuvres.primitives import MOVES
+from d4orm_planners.manoeuvres.rounds import compile_manoeuvres
 from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.sampling.loop import SamplingPlanner
 from d4orm_planners.tracking.tracker import follow_reference, reference_kernel, straight_kernel
 
 TEAMS = (*((model, model) for model in COMMON), ("holonomic2d", "differential_drive"))
 """The smallest teams of common models that have kernels of their own."""
+_MANOEUVRING = tuple(model for model in COMMON if model in MOVES)
+"""Common models that have manoeuvres."""
 
 
 def warm_up() -> None:
@@ -51,6 +56,7 @@ def warm_up() -> None:
     for models in TEAMS[:-1]:
         _brake(models)
     _step_environments()
+    compile_manoeuvres(_MANOEUVRING)
     other.wait()
     compile_ahead.sample_once(TEAMS)
     compile_ahead.drive_once(TEAMS[0])
@@ -99,7 +105,7 @@ def _step_environments() -> None:
 
 def _kernels() -> list[Dispatcher[Callable[..., object]]]:
     """The kernels of engines, guided plans and D4orm-C2F that are kept on disk."""
-    packages = (engine, paths, sampling_engine, tracking, mapf, d4orm_c2f)
+    packages = (engine, paths, sampling_engine, tracking, manoeuvres, mapf, d4orm_c2f)
     modules = [import_module(f"{package.__name__}.{module.name}") for package in packages
                for module in pkgutil.iter_modules(package.__path__) if "jax" not in module.name]  # fmt: skip
     found = {name: value for module in modules for name, value in vars(module).items() if isinstance(value, Dispatcher)}
@@ -112,6 +118,7 @@ def _kernels() -> list[Dispatcher[Callable[..., object]]]:
         *map(reference_kernel, COMMON),
     ]
     kernels += map(search_kernel, COMMON)
+    kernels += map(gap_closer, _MANOEUVRING)
     return [kernel for kernel in kernels if isinstance(kernel, Dispatcher) and kernel.stats.cache_path is not None]
 
 

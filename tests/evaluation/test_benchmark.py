@@ -308,6 +308,7 @@ def test_after_a_warm_up_nothing_is_left_to_compile(tmp_path: Path) -> None:
     if not re.search(r"^0 kernels compiled", again, re.MULTILINE):
         again = d4orm("warmup")
     assert re.search(r"^0 kernels compiled.* [1-9]\d* found in the cache", again, re.MULTILINE), again
+    assert any("find_motion" in kernel for kernel in kernels(again)), "no manoeuvres"
     told = python(tmp_path, "-c", PLAN.format("heterogeneous", ""), NUMBA_DEBUG_CACHE="1")
     told += d4orm("plan", "--num-robots", "3", "--out", "plan.npz", "--quiet")
     for command in (
