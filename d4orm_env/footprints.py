@@ -69,12 +69,24 @@ class Footprint(ABC):
     def inner_radius(self) -> float:
         """Radius of the largest disc or ball about the reference point within it, zero if there is none [m]."""
 
+    @property
+    def girth(self) -> float:
+        """Radius of the smallest upright cylinder about the reference point that holds it [m]."""
+        return self.outer_radius
+
+    @property
+    def wall_radius(self) -> float:
+        """Outer radius of what obstacles and bounds meet [m]."""
+        return self.outer_radius
+
     @abstractmethod
     def outline(self) -> Floats:
         """``(n, 2)`` points round it, counterclockwise, seen from above [m]: to draw it."""
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():  # type: ignore[call-overload] # all are dataclasses
+            if value is None:
+                continue
             title = f"{name} of {type(self).__name__}"
             number = real_number(value, title)
             if name != "offset":
@@ -106,6 +118,11 @@ class Disc(Footprint):
     def semi_axes(self) -> tuple[float, float, float]:
         """Its radius along each axis, as an ellipsoid's."""
         return self.radius, self.radius, self.radius
+
+    @property
+    def wall_axes(self) -> tuple[float, float, float]:
+        """The same."""
+        return self.semi_axes
 
     def outline(self) -> Floats:
         return self.radius * DIRECTIONS
@@ -218,25 +235,59 @@ class Polygon(Planar):
         return Core(np.array(self.corners), 0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Ellipsoid(Footprint):
     """An ellipsoid in space, its axes along those of the world: the room that a multirotor's downwash needs.
+
+    With a ``body``, the ellipsoid is for other robots only, whatever their footprints. Obstacles, moving ones too, and
+    bounds meet the ball of that radius.
 
     Attributes:
         x: Semi-axis along x [m].
         y: Semi-axis along y [m].
         z: Semi-axis along z [m].
+        body: Radius of the ball in it that obstacles and bounds meet [m]; ``None`` if they meet the ellipsoid.
+
+    Raises:
+        ValueError: If a size is no positive number, or the body is larger than a semi-axis.
     """
 
     x: float
     y: float
     z: float
+    body: float | None = None
     dimension = 3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.body is not None and self.body > min(self.semi_axes):
+            raise ValueError(
+                f"body of Ellipsoid is {self.body:g}; its ball must be within the ellipsoid, {min(self.semi_axes):g} "
+                "at most"
+            )
+
+    def __repr__(self) -> str:
+        # Without a body as it was before there were any: digests of problems are made of it.
+        body = "" if self.body is None else f", body={self.body!r}"
+        return f"Ellipsoid(x={self.x!r}, y={self.y!r}, z={self.z!r}{body})"
 
     @property
     def semi_axes(self) -> tuple[float, float, float]:
         """Along x, y and z."""
         return self.x, self.y, self.z
+
+    @property
+    def wall_axes(self) -> tuple[float, float, float]:
+        """The same of what obstacles and bounds meet."""
+        return self.semi_axes if self.body is None else (self.body, self.body, self.body)
+
+    @property
+    def girth(self) -> float:
+        return max(self.x, self.y)
+
+    @property
+    def wall_radius(self) -> float:
+        return max(self.wall_axes)
 
     def outline(self) -> Floats:
         return DIRECTIONS * (self.x, self.y)
@@ -247,7 +298,7 @@ class Ellipsoid(Footprint):
 
     @property
     def inner_radius(self) -> float:
-        return min(self.x, self.y, self.z)
+        return min(self.wall_axes)
 
 
 @dataclass(frozen=True, init=False)

@@ -97,6 +97,7 @@ class FootprintArrays(NamedTuple):
     inner: FloatArray  #: ``(F,)`` inner radii, a little less for rounding
     heading: Ints  #: ``(F,)`` int32 number of the state component that turns the footprint, -1 for none
     semi_axes: FloatArray  #: ``(F, 3)`` of ellipsoids and balls; zero in the plane
+    wall_axes: FloatArray  #: ``(F, 3)`` of what obstacles and bounds meet of these
     #: ``(F, 3)`` of cores that are rectangles, segments or points: half of the length and of the width, and how far
     #: ahead of the reference point the centre lies; -1 of others
     rectangles: FloatArray
@@ -109,11 +110,12 @@ class FootprintArrays(NamedTuple):
 def as_arrays(bodies: Sequence[Body]) -> FootprintArrays:
     """The arrays of these: one of each robot, in order, and then the trailers, those of a robot from its front on."""
     size = len(bodies)
+    semi_axes, wall_axes = np.zeros((2, size, 3), np.float32)
     arrays = FootprintArrays(
         np.zeros((size, MAX_CORNERS, 2), np.float32), np.zeros(size, np.int32),
         np.zeros((size, MAX_CORNERS, 2), np.float32), np.zeros((size, MAX_CORNERS), np.float32),
         np.zeros(size, np.int32), np.zeros(size, np.float32), np.zeros(size, np.float32),
-        np.full(size, -1, np.int32), np.zeros((size, 3), np.float32), np.full((size, 3), -1, np.float32),
+        np.full(size, -1, np.int32), semi_axes, wall_axes, np.full((size, 3), -1, np.float32),
         np.zeros(size, np.float32), np.arange(size, dtype=np.int32), np.full(size, -1, np.int32),
         np.zeros(size, np.int32),
     )  # fmt: skip
@@ -131,7 +133,7 @@ def as_arrays(bodies: Sequence[Body]) -> FootprintArrays:
 def _fill_shape(arrays: FootprintArrays, i: int, footprint: Footprint) -> None:
     arrays.inner[i] = footprint.inner_radius * (1 - 2.0**-20)
     if isinstance(footprint, Disc | Ellipsoid):
-        arrays.semi_axes[i] = footprint.semi_axes
+        arrays.semi_axes[i], arrays.wall_axes[i] = footprint.semi_axes, footprint.wall_axes
     if not isinstance(footprint, Disc | Planar):
         return
     corners, rounding = footprint.core

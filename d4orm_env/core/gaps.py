@@ -60,7 +60,7 @@ def nearest(problem: Problem, states: FloatArray, enough: float = np.inf) -> flo
     points, radius = states[:, :d].astype(np.float64), team.radius.astype(np.float64)
     outer = np.linalg.norm(points[:, None] - points, axis=2) - radius[:, None] - radius
     outer[np.tril_indices(len(outer), -1)] = np.inf
-    outer[np.diag_indices_from(outer)] = world.clearance(states[:, :d]) - radius
+    outer[np.diag_indices_from(outer)] = world.clearance(states[:, :d]) - team.wall_radius
     first, gap = int(outer.argmin()), gaps_at(team, team.body_poses(states), world)
     if outer.flat[first] < enough:
         least = gap(*divmod(first, len(outer)))
@@ -108,7 +108,7 @@ def world_gap(world: World, footprint: Footprint, pose: Floats) -> float:
     """Signed gap of a footprint to the nearest obstacle or bound [m]; see :func:`pair_gap`."""
     dimension, bounds = world.dimension, world.bounds.astype(np.float64)
     if dimension == 3:
-        low = high = _semi_axes(footprint)
+        low = high = np.array(footprint.wall_axes)  # type: ignore[attr-defined] # all in space have them
         gaps = list(_ball_gaps(world, pose[:3], low))
     else:
         core = _placed(footprint, pose)

@@ -47,7 +47,7 @@ def observe_robot(
     _find_nearest_robots(k, sensed.position, sensed.hidden, sensed.nearest_robots)
     _see_robots(k, sensed, neighbors, out)
     _find_nearest_obstacles(sensed.position[k], arrays, sensed.nearest_obstacles)
-    _see_obstacles(sensed.position[k], arrays, arrays.radius[k], sensed.nearest_obstacles, obstacles, out)
+    _see_obstacles(sensed.position[k], arrays, arrays.wall_radius[k], sensed.nearest_obstacles, obstacles, out)
 
 
 def _see_itself(k: int, arrays: ProblemArrays, goal: FloatArray, sensed: Sensed, out: FloatArray) -> None:

@@ -49,6 +49,7 @@ class ProblemArrays(NamedTuple):
     #: Of a team that is not all discs; the radii are then those of discs round them. Else ``None``: numba leaves out of
     #: a kernel what asks whether an argument is ``None`` and would go on if it were not.
     footprints: FootprintArrays | None
+    wall_radius: FloatArray  #: ``(K,)`` radii of what obstacles and bounds meet, of discs the same
 
 
 def inverse_initial_distance(positions: FloatArray, goal: FloatArray, goal_radius: float) -> FloatArray:
@@ -94,6 +95,7 @@ def as_arrays(problem: Problem, grid: WorldIndex) -> ProblemArrays:
         goal_direction=_goal_directions(problem.goal_heading, problem.goal_hitches) if turns else None,
         squared_goal_chord=_squared_chords(problem.goal_heading, problem.goal_heading_tolerance) if turns else None,
         footprints=problem.team.footprint_arrays,
+        wall_radius=problem.team.wall_radius,
     )
     return read_only(arrays)
 

@@ -204,7 +204,7 @@ def check_positions(
     Returned is what is nearest within the margin, for an error or a warning: the empty string if nothing is.
     """
     radius, shaped = team.radius.astype(np.float64), bool(team.shapes)
-    gaps = world.clearance(positions) - radius
+    gaps = world.clearance(positions) - team.wall_radius.astype(np.float64)
     if poses is None:
         poses = np.column_stack([positions.astype(np.float64), np.full(len(positions), np.nan)])
     gap_of = gaps_at(team, poses, world)

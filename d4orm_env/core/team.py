@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +26,8 @@ from d4orm_env.core.bodies import Body, FootprintArrays, as_arrays, body_poses, 
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
 from d4orm_env.footprints import Disc, Footprint, Train
+
+Flattened = TypeVar("Flattened", FloatArray, Floats)
 
 DEFAULT_RADIUS, DEFAULT_MARGIN = 0.15, 0.05
 """Radius of a robot and safety margin [m]."""
@@ -141,6 +143,41 @@ class Team(Frozen):
     def footprint(self) -> tuple[Footprint, ...]:
         """``K`` footprints."""
         return self.shapes or tuple(Disc(radius) for radius in self.radius.tolist())
+
+    @cached_property
+    def wall_radius(self) -> FloatArray:
+        """``(K,)`` outer radius of what obstacles and bounds meet [m]."""
+        return self._sizes("wall_radius")
+
+    @cached_property
+    def girth(self) -> FloatArray:
+        """``(K,)`` radius of the upright cylinder, or of the disc, round each robot [m]; see :meth:`flattening`."""
+        return self._sizes("girth")
+
+    def _sizes(self, name: str) -> FloatArray:
+        """``(K,)`` a radius of the robots, that is of ellipsoids another than the outer one."""
+        if not self.shapes or self.dimension == 2:
+            return self.radius
+        return read_only(np.array([getattr(shape, name) for shape in self.shapes], np.float32))
+
+    def flattening(self, margin: float) -> float:
+        """Factor for heights, at most one, by which robots that are within the margin are as near as balls.
+
+        Where heights are so much less, no two robots are within the margin unless balls of their girths are; of robots
+        with the same upright ellipsoid these are just those.
+        """
+        if not self.shapes or self.dimension == 2:
+            return 1.0
+        axes, wider = np.array([shape.semi_axes for shape in self.shapes]), margin / 2  # type: ignore[attr-defined]
+        return float(((axes[:, :2].max(axis=1) + wider) / (axes[:, 2] + wider)).min(initial=1.0))
+
+    def flattened(self, positions: Flattened, margin: float) -> Flattened:
+        """Positions ``(..., d)`` with heights so much less."""
+        factor = self.flattening(margin)
+        if factor == 1:
+            return positions
+        flat: Flattened = positions * np.array([1, 1, factor], positions.dtype)
+        return flat
 
     @property
     def inner_radius(self) -> Floats:
@@ -262,11 +299,11 @@ class Team(Frozen):
 
     @cached_property
     def largest_radius(self) -> float:
-        """The largest of the radii [m], by which methods measure lengths.
+        """The largest of the radii, of ellipsoids the girths [m], by which methods measure lengths.
 
         It is rounded as float32 is, but so that it is the decimal number for robots of the default radius.
         """
-        return DEFAULT_RADIUS * (float(self.radius.max()) / float(np.float32(DEFAULT_RADIUS)))
+        return DEFAULT_RADIUS * (float(self.girth.max()) / float(np.float32(DEFAULT_RADIUS)))
 
     @cached_property
     def turning_radius(self) -> FloatArray:

@@ -66,7 +66,7 @@ def check_problem(problem: Problem) -> None:
             raise ValueError(f"robot_{robot} is a {name}, which is no drone in crazyflow; use {MODEL}")
     for what, height in (("start", problem.start[:, 2]), ("goal", problem.goal[:, 2])):
         lowest = int(np.argmin(height))
-        if height[lowest] <= max(FLOOR, float(problem.team.radius[lowest])):
+        if height[lowest] <= max(FLOOR, float(problem.team.wall_radius[lowest])):
             raise ValueError(
                 f"{what} of robot_{lowest} is {height[lowest]:.3g} m high, and the floor is at 0; give the scenario a "
                 "height, as height=1"

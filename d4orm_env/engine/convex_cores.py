@@ -128,8 +128,11 @@ def balls_within(
     """Check whether two ellipsoids with these semi-axes, offset by ``(x, y, z)``, touch (Perram and Wertheim, 1985).
 
     They are apart where ``s (1 - s) (x^2 / ((1 - s) a^2 + s b^2) + ...)`` exceeds one for some weight ``s``. It is
-    concave in ``s``: its slope is bisected.
+    concave in ``s``: its slope is bisected. Of two that are alike the best weight is one half.
     """
+    if a == b:
+        x, y, z = _HALF * x / a[0], _HALF * y / a[1], _HALF * z / a[2]
+        return bool(x * x + y * y + z * z <= ONE)
     low, high, most = ZERO, ONE, ZERO
     for _ in range(BISECTIONS):
         s = _HALF * (low + high)

@@ -26,7 +26,7 @@ from d4orm_env.engine.convex_cores import (
 )
 from d4orm_env.engine.elementary import cosine, sine
 from d4orm_env.engine.obstacles import cell_at
-from d4orm_env.engine.simd import BIT, CHUNK, NOWHERE, TILE, use_wide_registers
+from d4orm_env.engine.simd import BIT, CHUNK, NOWHERE, TILE, chunk_at_most, use_wide_registers
 
 POSE = 4
 """Rows of a body's pose."""
@@ -71,6 +71,12 @@ def _semi_axes(
 
 
 @compiled
+def _wall_axes(f: FootprintArrays, k: Whole, wider: np.float32) -> tuple[np.float32, np.float32, np.float32]:
+    """The semi-axes of what obstacles meet of robot ``k``, each longer by ``wider``."""
+    return f.wall_axes[k, 0] + wider, f.wall_axes[k, 1] + wider, f.wall_axes[k, 2] + wider
+
+
+@compiled
 def _place_own(f: FootprintArrays, i: Whole, poses: FloatArray, stride: int, begin: Whole, core: FloatArray) -> None:
     """Write body ``i`` of a robot about the robot's position."""
     o = i * stride + begin
@@ -106,11 +112,12 @@ def meets_body(
     """Check whether robot ``k`` is within ``extra`` of another body, offset by ``(x, y, z)`` from it.
 
     That is number ``other`` of ``others``, its bodies' headings in ``turns``, or a disc or ball of its radius if it is
-    number -1.
+    number -1: an obstacle.
     """
     if not planar:
         wider = _HALF * extra
-        return balls_within(x, y, z, _semi_axes(f, k, own_radius, wider), _semi_axes(others, other, radius, wider))
+        own = _wall_axes(f, k, wider) if other < 0 else _semi_axes(f, k, own_radius, wider)
+        return balls_within(x, y, z, own, _semi_axes(others, other, radius, wider))
     core = buffer[TILE : 2 * TILE]
     if other < 0:
         place_disc(radius, x, y, core)
@@ -129,10 +136,20 @@ def meets_body(
 @compiled
 def _refine_balls(
     f: FootprintArrays, k: Whole, other: Whole, near: np.uint64, extra: np.float32, positions: FloatArray,
-    a: Whole, b: Whole,
+    a: Whole, b: Whole, buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
     sure, unsure, wider = near, near, _HALF * extra
     own, its = _semi_axes(f, k, ZERO, wider), _semi_axes(f, other, ZERO, wider)
+    if own == its:  # touching where points of the same shape twice as large do: all samples at once
+        scale_x, scale_y, scale_z = _HALF / own[0], _HALF / own[1], _HALF / own[2]
+        for lane in range(CHUNK):
+            x, y = (
+                scale_x * (positions[b + lane] - positions[a + lane]),
+                scale_y * (positions[b + TILE + lane] - positions[a + TILE + lane]),
+            )
+            z = scale_z * (positions[b + 2 * TILE + lane] - positions[a + 2 * TILE + lane])
+            buffer[lane] = x * x + y * y + z * z
+        return chunk_at_most(buffer, 0, ONE) & near
     while unsure != NOWHERE:
         s = np.int64(trailing_zeros(unsure))
         unsure &= unsure - BIT
@@ -176,7 +193,7 @@ def refine_chunk(
     if near == NOWHERE:
         return near
     if dimension == 3:
-        return _refine_balls(f, k, other, near, extra, positions, a, b)
+        return _refine_balls(f, k, other, near, extra, positions, a, b, buffer)
     touch, i = NOWHERE, np.int64(k)
     while i >= 0:
         j = np.int64(other)
@@ -224,7 +241,7 @@ def _leaves_bounds(
     for axis in range(dimension):
         low = high = ZERO
         if dimension == 3:
-            high = f.semi_axes[i, axis]
+            high = f.wall_axes[i, axis]
             low = -high
         else:
             low, high = np.float32(np.inf), np.float32(-np.inf)
@@ -263,7 +280,7 @@ def touches_static(
     for number in range(index.first[cell], index.first[cell + 1]):
         item = np.int64(index.items[number])
         if dimension == 3:
-            if ball_meets_box(arrays.boxes, item, x, y, z, _semi_axes(f, k, arrays.radius[k], extra)):
+            if ball_meets_box(arrays.boxes, item, x, y, z, _wall_axes(f, k, extra)):
                 return True
             continue
         if item < arrays.boxes.shape[0]:
@@ -285,11 +302,13 @@ def refine_static(
     """Mask of the samples, of those ``near``, in which robot ``k`` is within ``extra`` of an obstacle or a bound.
 
     Its positions are in the first rows of ``positions``; ``buffer`` is two rows to overwrite. ``f`` is as in
-    :func:`refine_chunk`.
+    :func:`refine_chunk`. ``near`` are those in which the disc or ball of its ``wall_radius`` is.
     """
     if f is None:
         return near
     sure, unsure, planar = near, near, arrays.goal.shape[1] == 2
+    if not planar and f.wall_axes[k, 0] == f.wall_axes[k, 1] and f.wall_axes[k, 0] == f.wall_axes[k, 2]:
+        return near
     while unsure != NOWHERE:
         s = np.int64(trailing_zeros(unsure))
         unsure &= unsure - BIT

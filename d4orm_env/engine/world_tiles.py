@@ -98,8 +98,8 @@ def _meets_body(
     z = body[2] - w[position + 2 * TILE] if dimension == 3 else ZERO
     buffer, poses = w[k * STRIDE + BUFFER * TILE : k * STRIDE + ROWS * TILE], arrays.radius.shape[0] * STRIDE + s
     return meets_body(
-        f, k, arrays.radius[k], w, POSE * TILE, poses, f, -1, body[2 * dimension], w, x, y, z, dimension == 2, extra,
-        buffer,
+        f, k, arrays.wall_radius[k], w, POSE * TILE, poses, f, -1, body[2 * dimension], w, x, y, z, dimension == 2,
+        extra, buffer,
     )  # fmt: skip
 
 
@@ -112,7 +112,7 @@ def _mark_static(
     for k in range(num_robots):
         robot = w[k * STRIDE : (k + 1) * STRIDE]
         positions, buffer = robot[STATE * TILE : CONTROL * TILE], robot[BUFFER * TILE : ROWS * TILE]
-        touch = lanes & obstacles.near_obstacles(arrays, arrays.radius[k] + extra, positions, buffer)
+        touch = lanes & obstacles.near_obstacles(arrays, arrays.wall_radius[k] + extra, positions, buffer)
         touch = refine_static(f, arrays, k, touch, extra, positions, w, POSE * TILE, num_robots * STRIDE, buffer)
         near[k, OBSTACLE] |= touch
 
@@ -132,7 +132,7 @@ def _mark_bodies(
                 for axis in range(dimension):
                     gap = bodies[first + s, i, axis] - w[k * STRIDE + (STATE + axis) * TILE + s]
                     gap2 += gap * gap
-                distance = arrays.radius[k] + bodies[first + s, i, 2 * dimension] + extra
+                distance = arrays.wall_radius[k] + bodies[first + s, i, 2 * dimension] + extra
                 if gap2 <= distance * distance and _meets_body(
                     arrays.footprints, arrays, bodies[first + s, i], k, s, extra, w
                 ):

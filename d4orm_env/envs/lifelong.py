@@ -81,7 +81,7 @@ def given_goal(
             f"{name} is {goal.tolist()}; it must lie between {low.tolist()} and {high.tolist()}: give the world other "
             "bounds, which without them follow from starts and goals"
         )
-    radius = float(problem.team.radius[robot])
+    radius = float(problem.team.wall_radius[robot])
     if (clearance := float(problem.world.clearance(goal))) < radius:
         raise ValueError(
             f"{name} is {goal.tolist()}, where the clearance from obstacles and bounds is {clearance:.3g} m; it must "
@@ -108,7 +108,7 @@ def fresh_goal(
     low, high = goal_region(problem).astype(np.float64)
     for _ in range(_ATTEMPTS):
         candidates = random.uniform(low, high, (_BATCH, problem.dimension))
-        free = problem.world.clearance(candidates) > radius[robot] + problem.margin
+        free = problem.world.clearance(candidates) > problem.team.wall_radius[robot] + problem.margin
         gaps = np.linalg.norm(candidates[:, None] - bodies, axis=-1) - keep_off
         free &= (gaps > 0).all(axis=1)
         if free.any() and problem.world.num_obstacles and np.isfinite(problem.shortest_paths.length[robot]):

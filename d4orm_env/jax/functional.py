@@ -215,6 +215,7 @@ def _arrays(problem: Problem) -> ProblemArrays:
         ),
         "squared_goal_chord": jnp.where(jnp.isnan(heading), jnp.inf, 4 * jnp.sin(tolerance / 2) ** 2),
         "footprints": team.footprint_arrays,
+        "wall_radius": jnp.asarray(team.wall_radius),
     }
     return ProblemArrays(**arrays)
 

@@ -40,6 +40,7 @@ class PlacedBodies(NamedTuple):
     extents: Array  #: ``(m, R, S)`` how far the cores reach along them
     rounding: Array  #: ``(R, 1)``
     semi_axes: Array  #: ``(3, R, 1)`` of ellipsoids
+    wall_axes: Array  #: ``(3, R, 1)`` of what obstacles and bounds meet of them
 
 
 def place_robots(f: FootprintArrays | None, state: Array, dimension: int, radius: Given | None = None) -> PlacedBodies:
@@ -96,7 +97,8 @@ def place_bodies(bodies: MovingBodies) -> PlacedBodies:
 def _discs(position: Array, radius: Array) -> PlacedBodies:
     size = radius[:, None]
     nothing = jnp.zeros((2, 1, *size.shape), jnp.float32)
-    return PlacedBodies(position, nothing, nothing, nothing[0], size, jnp.broadcast_to(size, (3, *size.shape)))
+    axes = jnp.broadcast_to(size, (3, *size.shape))
+    return PlacedBodies(position, nothing, nothing, nothing[0], size, axes, axes)
 
 
 def _bodies(f: FootprintArrays, position: Array, heading: Array) -> PlacedBodies:
@@ -108,8 +110,11 @@ def _bodies(f: FootprintArrays, position: Array, heading: Array) -> PlacedBodies
         return jnp.stack([cosine[None] * x - sine[None] * y, sine[None] * x + cosine[None] * y])
 
     extents = jnp.asarray(f.extents).T[..., None]
-    rounding, semi_axes = jnp.asarray(f.rounding)[:, None], jnp.asarray(f.semi_axes).T[..., None]
-    return PlacedBodies(position, turned(f.corners), turned(f.axes), extents, rounding, semi_axes)
+    rounding, axes = (
+        jnp.asarray(f.rounding)[:, None],
+        (jnp.asarray(own).T[..., None] for own in (f.semi_axes, f.wall_axes)),
+    )
+    return PlacedBodies(position, turned(f.corners), turned(f.axes), extents, rounding, *axes)
 
 
 def pairs_within(bodies: PlacedBodies, others: PlacedBodies, extra: Given) -> Array:
@@ -179,7 +184,7 @@ def static_contacts(arrays: ProblemArrays, state: Array, extra: Given) -> Array:
     dimension, extra = arrays.goal.shape[1], jnp.asarray(extra)
     bodies = place_robots(arrays.footprints, state, dimension)
     if dimension == 3:
-        low, high = bodies.semi_axes, bodies.semi_axes
+        low, high = bodies.wall_axes, bodies.wall_axes
     else:
         rounding = bodies.rounding[None]
         low, high = rounding - bodies.corners.min(axis=1), rounding + bodies.corners.max(axis=1)
@@ -205,7 +210,7 @@ def _meets_box(bodies: PlacedBodies, box: Array, extra: Array) -> Array:
         corners = jnp.stack([lower, jnp.stack([upper[0], lower[1]]), upper, jnp.stack([lower[0], upper[1]])], axis=1)
         return _cores_within(bodies, _polygon(corners, rounding), -bodies.position, extra)
     gap = jnp.clip(bodies.position, lower[:, None, None], upper[:, None, None]) - bodies.position
-    axes = bodies.semi_axes + extra
+    axes = bodies.wall_axes + extra
     sharp = ((gap / axes) ** 2).sum(axis=0) <= 1
     ball = jnp.where(rounding > 0, rounding, 1)
     return jnp.where(rounding > 0, _balls_within(gap, axes, jnp.broadcast_to(ball, (3, 1, 1))), sharp)
@@ -219,4 +224,4 @@ def _polygon(corners: Array, rounding: Array) -> PlacedBodies:
     extents = (axes[:, :, None] * corners[:, None]).sum(axis=0).max(axis=1)
     parts = corners[..., None, None], axes[..., None, None], extents[:, None, None]
     nowhere = jnp.zeros((2, 1, 1), jnp.float32)
-    return PlacedBodies(nowhere, *parts, jnp.full((1, 1), rounding, jnp.float32), nowhere)
+    return PlacedBodies(nowhere, *parts, jnp.full((1, 1), rounding, jnp.float32), nowhere, nowhere)

@@ -137,7 +137,7 @@ def _obstacles(arrays: ProblemArrays, position: Columns, count: int) -> Columns:
     """``d + 2`` for each."""
 
     def seen(distance: Array, vector: Columns) -> tuple[Array, Columns]:
-        return distance, [*vector, distance - arrays.radius]
+        return distance, [*vector, distance - arrays.wall_radius]
 
     nearest = _Nearest.nothing(len(arrays.radius), count, len(position) + 1)
     for to_one, things in ((_to_box, arrays.boxes), (_to_triangle, arrays.triangles)):

@@ -92,7 +92,7 @@ class ShortestPaths:
         if len(robots):
             names = ", ".join(f"robot_{robot}" for robot in robots)
             distances = sorted(
-                {f"{radius + self.problem.margin:.4g}" for radius in np.asarray(self.problem.team.radius)[robots]}
+                {f"{radius + self.problem.margin:.4g}" for radius in self.problem.team.wall_radius[robots]}
             )
             shaped = bool(self.problem.team.shapes)
             raise ValueError(
@@ -134,7 +134,7 @@ def shortest_paths(problem: Problem) -> ShortestPaths:
     if not problem.world.num_obstacles:
         return ShortestPaths(problem, np.linalg.norm(problem.goal - start, axis=1), None)
     space, starts = spaces.make_space(problem), in_space(start)[:, None]
-    safety_distances = np.asarray(problem.team.radius, np.float64) + problem.margin
+    safety_distances = np.asarray(problem.team.wall_radius, np.float64) + problem.margin
     lattices: dict[tuple[float, int], Lattice] = {}
     chosen: list[tuple[float, int]] = []
     fronts: list[Front] = []

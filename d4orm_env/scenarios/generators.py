@@ -226,7 +226,8 @@ def antipodal_sphere(settings: Settings, diameter: float) -> Layout:
     """Robots on the Fibonacci points of a sphere, goals at the antipodes."""
     require_dimension(settings, 3)
     points = fibonacci_sphere(settings.num_robots)
-    gaps = (np.linalg.norm(points[:index] - points[index], axis=1).min() for index in range(1, len(points)))
+    flat = settings.team.flattened(points, settings.margin)
+    gaps = (np.linalg.norm(flat[:index] - flat[index], axis=1).min() for index in range(1, len(flat)))
     needed = 2 * settings.spacing / float(min(gaps, default=np.inf))
     if needed >= diameter:
         raise _too_small(settings, "diameter", diameter, needed)

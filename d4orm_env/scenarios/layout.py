@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -179,7 +180,7 @@ def _require_inside(settings: Settings, world: World, starts: Floats, goals: Flo
     if settings.bounds is None and settings.height is None:
         return
     lower, upper = world.bounds.astype(np.float64)
-    needed = np.asarray(settings.team.radius, np.float64) + settings.margin
+    needed = np.asarray(settings.team.wall_radius, np.float64) + settings.margin
     for what, positions in (("start", starts), ("goal", goals)):
         gaps: Floats = np.minimum(positions - lower, upper - positions).min(axis=1)
         robot = int(np.argmin(gaps - needed))
@@ -205,9 +206,12 @@ def scatter(settings: Settings, size: float) -> tuple[Floats, Floats]:
     area = PlacementArea(np.full(dimension, size / 2))
     needed = max(_size_for(count, settings.spacing, dimension), 3 * settings.goal_radius)
     starts, goals = np.empty((0, dimension)), np.empty((0, dimension))
+    flatten = partial(settings.team.flattened, margin=settings.margin)
     for robot in range(count if needed <= size else 0):
-        starts = _with_another(random, area, starts, settings.spacing)
-        goals = _with_another(random, area, goals, settings.spacing, (starts[robot:], settings.goal_radius))
+        starts = _with_another(random, area, starts, settings.spacing, flatten=flatten)
+        goals = _with_another(
+            random, area, goals, settings.spacing, (starts[robot:], settings.goal_radius), flatten=flatten
+        )
         if min(len(starts), len(goals)) == robot:
             break
     if min(len(starts), len(goals)) < count:
@@ -236,8 +240,9 @@ def with_random_obstacles(settings: Settings, world: World, positions: Floats, a
         return world
     random = settings.generator(OBSTACLES)
     size = float(np.float32(settings.obstacle_radius))
-    passage = 2 * (float(np.max(settings.team.radius)) + settings.margin)
-    safety_distance = np.tile(np.float64(settings.team.radius), 2) + size + settings.margin
+    radius = np.float64(settings.team.wall_radius)
+    passage = 2 * (float(radius.max()) + settings.margin)
+    safety_distance = np.tile(radius, 2) + size + settings.margin
     balls: Floats = np.empty((0, world.dimension))
 
     def is_free(centres: Floats) -> BoolArray:
@@ -264,15 +269,17 @@ def round_up(value: float) -> str:
 
 
 def _with_another(
-    random: np.random.Generator, area: PlacementArea, points: Floats, spacing: float, *others: tuple[Floats, float]
-) -> Floats:
+    random: np.random.Generator, area: PlacementArea, points: Floats, spacing: float, *others: tuple[Floats, float],
+    flatten: Callable[[Floats], Floats],
+) -> Floats:  # fmt: skip
     """``points`` and a random one further than ``spacing`` from each, or just ``points`` if there is no room.
 
-    It keeps a distance of their own from each of ``others`` too.
+    It keeps a distance of their own from each of ``others`` too. Spacing is measured between flattened positions.
     """
 
     def is_free(candidates: Floats) -> BoolArray:
-        return np.all([_gaps(candidates, *kept) > 0 for kept in ((points, spacing), *others)], axis=0)
+        spaced = _gaps(flatten(candidates), flatten(points), spacing) > 0
+        return np.all([spaced, *(_gaps(candidates, *kept) > 0 for kept in others)], axis=0)
 
     position = _first(random, area, is_free)
     return points if position is None else np.vstack([points, position])

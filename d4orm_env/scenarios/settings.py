@@ -95,8 +95,8 @@ class Settings:
 
     @property
     def spacing(self) -> float:
-        """Distance between the centres of the two largest robots whose surfaces are one margin apart [m]."""
-        return 2 * float(np.max(self.team.radius)) + self.margin
+        """Distance between the centres of the two largest robots that are side by side one margin apart [m]."""
+        return 2 * float(np.max(self.team.girth)) + self.margin
 
     def generator(self, purpose: int) -> np.random.Generator:
         """The seed's random numbers for one purpose: drawing obstacles does not move the robots."""

@@ -203,7 +203,7 @@ def reserve_of(settings: Settings) -> float:
 
 def safety_distance_of(settings: Settings) -> float:
     """Distance that the centre of the largest robot keeps to obstacles [m]."""
-    return float(np.max(settings.team.radius)) + settings.margin + reserve_of(settings)
+    return float(np.max(settings.team.wall_radius)) + settings.margin + reserve_of(settings)
 
 
 def lattice_step(settings: Settings, sides: ArrayLike, passage: tuple[str, float] | None = None) -> float:
@@ -258,7 +258,7 @@ def draw_team(
     random = settings.generator(STARTS_AND_GOALS)
     count = settings.num_robots
     # A robot may dock anywhere within the goal radius.
-    apart = settings.spacing + settings.goal_radius + reserve_of(settings)
+    apart = settings.spacing / settings.team.flattening(settings.margin) + settings.goal_radius + reserve_of(settings)
     separation = math.sqrt(apart * apart + space.step * space.step / 4)
     number = np.arange(2 * count)
     groups: list[tuple[BoolArray | None, int]] = [(None, 2 * count)]

@@ -283,8 +283,13 @@ def make_watches(
     """
     if shapes is None:
         return Pairs(robot, radius), surroundings(world, robot, radius)
+    pairs = TurningPairs(robot, shapes)
+    if world.dimension == 3:
+        shapes = shapes.at_walls()
+        if (shapes.stretch == 1).all():
+            return pairs, surroundings(world, robot, shapes.outer)
     watches: list[Watch] = [Obstacles(robot, shapes, world)] if world.num_obstacles else []
     if world.lower is not None:
         lower, upper = (np.asarray(bound, np.float64) for bound in (world.lower, world.upper))
         watches.append(Sides(robot, shapes, lower, upper))
-    return TurningPairs(robot, shapes), watches
+    return pairs, watches

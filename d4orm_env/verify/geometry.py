@@ -5,7 +5,7 @@ Sums over components are written out: how NumPy's own reductions group them depe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -122,6 +122,7 @@ class ConvexBodies:
     corners: Floats  #: ``(B, n, 2)`` of planar cores, the last one repeated; of no use in space
     rounding: Floats  #: ``(B,)``
     semi_axes: Floats  #: ``(B, 3)`` in space
+    wall_axes: Floats  #: ``(B, 3)`` of what obstacles and bounds meet in space
     outer: Floats  #: ``(B,)`` radii of the discs or balls round them
     stretch: Floats  #: ``(B,)`` how much faster a gap may change than a body moves
 
@@ -131,21 +132,26 @@ class ConvexBodies:
         bodies: list[Any] = [getattr(footprint, "front", footprint) for footprint in team.footprint]
         bodies += [trailer for footprint in team.footprint for trailer in getattr(footprint, "trailers", ())]
         size, most = len(bodies), 1 if team.dimension == 3 else max(len(footprint.core[0]) for footprint in bodies)
-        corners, rounding, semi_axes = np.zeros((size, most, 2)), np.zeros(size), np.ones((size, 3))
+        corners, rounding, (semi_axes, wall_axes) = np.zeros((size, most, 2)), np.zeros(size), np.ones((2, size, 3))
         for robot, footprint in enumerate(bodies):
             if team.dimension == 3:
                 semi_axes[robot] = footprint.semi_axes
+                body = getattr(footprint, "body", None)
+                wall_axes[robot] = footprint.semi_axes if body is None else body
                 continue
             own, rounding[robot] = footprint.core
             corners[robot, : len(own)], corners[robot, len(own) :] = own, own[-1]
         outer = np.array([footprint.outer_radius for footprint in bodies]).astype(np.float32).astype(np.float64)
-        return cls(corners, rounding, semi_axes, outer, semi_axes.max(axis=1) / semi_axes.min(axis=1))
+        return cls(corners, rounding, semi_axes, wall_axes, outer, semi_axes.max(axis=1) / semi_axes.min(axis=1))
 
     def take(self, index: Indices) -> ConvexBodies:
         """Some of them, in the order given."""
-        return ConvexBodies(
-            self.corners[index], self.rounding[index], self.semi_axes[index], self.outer[index], self.stretch[index]
-        )
+        return ConvexBodies(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def at_walls(self) -> ConvexBodies:
+        """What obstacles and bounds meet of bodies in space."""
+        axes, outer = self.wall_axes, self.wall_axes.max(axis=1).astype(np.float32).astype(np.float64)
+        return replace(self, semi_axes=axes, outer=outer, stretch=axes.max(axis=1) / axes.min(axis=1))
 
     def placed(self, index: Indices, position: Floats, turn: Floats) -> Floats:
         """``(N, n, 2)`` corners of bodies at positions ``(N, 2)`` turned by ``(N,)``."""
@@ -207,11 +213,13 @@ def ball_gap(offset: Floats, a: Floats, b: Floats) -> Floats:
         return parts[..., 0] + parts[..., 1] + parts[..., 2]
 
     width = WEIGHTS[1] - WEIGHTS[0]
-    tried = np.stack([value(np.full(len(offset), weight)) for weight in WEIGHTS])
-    best = WEIGHTS[tried.argmax(axis=0)]
-    low, high = best - width, best + width
-    golden = (np.sqrt(5.0) - 1) / 2
-    for _ in range(GOLDEN_STEPS):
+    golden, best = (np.sqrt(5.0) - 1) / 2, np.full(len(offset), 0.5)  # it is the best of two that are alike
+    alike = bool((a == b).all())
+    if not alike:
+        tried = np.stack([value(np.full(len(offset), weight)) for weight in WEIGHTS])
+        best = WEIGHTS[tried.argmax(axis=0)]
+    low, high = (best, best) if alike else (best - width, best + width)
+    for _ in range(0 if alike else GOLDEN_STEPS):
         left, right = high - golden * (high - low), low + golden * (high - low)
         rising = value(left) < value(right)
         low, high = np.where(rising, left, low), np.where(rising, high, right)

@@ -93,7 +93,7 @@ def failed_robots(trajectory: Trajectory, check_interval: int = 1) -> BoolArray:
 
 def step_faults(problem: Problem, trajectory: Trajectory, unreachable: Set[int]) -> dict[int, list[str]]:
     """Faults of each failing robot at the steps; ``unreachable`` are those without a path to their goals."""
-    near = conflicts(trajectory.positions, problem.team.radius, problem.margin)
+    near = team_conflicts(problem, trajectory.positions)
     rounding = ["comes so near to the margin of something that rounding decides"]
     faults = {}
     for robot in np.flatnonzero(failed_robots(trajectory)).tolist():
@@ -113,7 +113,7 @@ def _missed_goal(problem: Problem, trajectory: Trajectory, robot: int, unreachab
         if steps > problem.horizon:
             yield f"needs {steps} steps at full speed, where the horizon is {problem.horizon}; give a longer horizon"
     if unreachable:
-        safety_distance = problem.team.radius[robot] + problem.margin
+        safety_distance = problem.team.wall_radius[robot] + problem.margin
         yield f"has no path from start to goal that is {safety_distance:.4g} m clear of obstacles"
 
 
@@ -135,6 +135,11 @@ def conflicts(positions: FloatArray, radius: ArrayLike, margin: float) -> Graph:
     Of ``positions`` ``(H+1, K, d)`` and ``radius`` ``(K,)``, all in metres.
     """
     return graph_of(positions.shape[1], path_index.PathIndex(positions, radius, margin).pairs())
+
+
+def team_conflicts(problem: Problem, positions: FloatArray) -> Graph:
+    """The same of a problem's robots, as far as the upright cylinders or discs round them tell."""
+    return graph_of(problem.num_robots, path_index.team_index(problem.team, positions, problem.margin).pairs())
 
 
 def graph_of(num_robots: int, pairs: IntArray) -> Graph:

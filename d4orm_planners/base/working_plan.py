@@ -56,14 +56,12 @@ class WorkingPlan:
             self.reported[robots] = np.minimum(self.reported[robots], step)
         # The engine, in float32, must not find near what this has found clear.
         margin = self.problem.margin + self.problem.rounding
-        self.index = path_index.PathIndex(trajectory.positions, self.problem.team.radius, margin)
+        self.index = path_index.team_index(self.problem.team, trajectory.positions, margin)
         self._interval = search.check_interval
         # Who fails is looked for at some steps only, paths around others are at all of them.
         self._checked = self.index
         if self._interval > 1:
-            self._checked = path_index.PathIndex(
-                trajectory.positions[:: self._interval], self.problem.team.radius, margin
-            )
+            self._checked = path_index.team_index(self.problem.team, trajectory.positions[:: self._interval], margin)
 
     @property
     def positions(self) -> FloatArray:

@@ -88,7 +88,9 @@ class Barriers(NamedTuple):
 def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, speed_slack: float) -> Barriers:
     """Return the barriers for the velocities of robots that are ``free``."""
     d = problem.dimension
-    positions, radius = joint.states[:, :d].astype(np.float64), np.asarray(problem.team.radius, np.float64)
+    positions = joint.states[:, :d].astype(np.float64)
+    radius, wall_radius = (np.asarray(of, np.float64) for of in (problem.team.girth, problem.team.wall_radius))
+    flat = np.where(np.arange(d) == 2, problem.team.flattening(max(gap, 0.0)), 1.0)
     acceleration, speed = (problem.team.limits[:, limit].astype(np.float64) for limit in (ACCELERATION, SPEED))
     at_once = np.array([model.first_order for model in problem.team.robot_models])
     braking = np.where(free, np.where(at_once, speed / problem.dt, acceleration), 0)
@@ -106,9 +108,13 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
     reaction = problem.dt if speed_slack else 0.0
     near = NEAR * problem.team.largest_radius + STOPS * float((speed**2 / (2 * acceleration)).max())
     offsets = positions[:, None] - positions
-    separation = np.linalg.norm(offsets, axis=2)
+    separation = np.linalg.norm(offsets * flat, axis=2)
     for i, j in np.argwhere(np.triu((separation > 0) & (separation < near) & (free[:, None] | free))).tolist():
         normal, room = offsets[i, j] / separation[i, j], float(separation[i, j]) - radius[i] - radius[j] - gap
+        if flat[-1] < 1:  # along the steepest way out of the ellipsoid, and how far that is
+            normal = normal * flat * flat
+            length = float(np.linalg.norm(normal))
+            normal, room = normal / length, room / length
         add(i if free[i] else -1, j if free[j] else -1, normal, room, braking[i] + braking[j])
     able = np.flatnonzero(free).tolist()
     for body in joint.bodies[joint.bodies[:, -1] > 0] if len(joint.bodies) else ():
@@ -118,9 +124,9 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
             if 0 < away < near:
                 normal = offset / away
                 leaving = float((normal * body[d : 2 * d]).sum())
-                add(i, -1, normal, away - radius[i] - float(body[-1]) - gap, braking[i], leaving)
+                add(i, -1, normal, away - wall_radius[i] - float(body[-1]) - gap, braking[i], leaving)
     for i, normal, room in _walls(problem, positions[able], able, near):
-        add(i, -1, normal, room - radius[i] - gap, braking[i])
+        add(i, -1, normal, room - wall_radius[i] - gap, braking[i])
     one, other, normals, least = zip(*rows) if rows else ((), (), (), ())
     return Barriers(
         np.array(one, np.int64), np.array(other, np.int64), np.array(normals).reshape(-1, d), np.array(least, float)

@@ -117,14 +117,18 @@ def visible_subgoals(
         arrived: ``(K,)`` robots at rest.
         walls: Whether obstacles count too.
     """
-    radius, resting = np.asarray(problem.team.radius), np.flatnonzero(arrived)
+    team, resting = problem.team, np.flatnonzero(arrived)
+    radius, wall_radius = np.asarray(team.girth), np.asarray(team.wall_radius)
+    flat, flat_path = (team.flattened(at, problem.margin) for at in (positions, path))
     result = targets.copy()
     waiting = np.flatnonzero(~arrived & (targets > indices + LEAST))
     while len(waiting):
-        offset = path[result[waiting], waiting] - positions[waiting]
+        offset = flat_path[result[waiting], waiting] - flat[waiting]
         width = radius[waiting] + problem.margin / 2
-        blocked = _meets_resting(positions[waiting], offset, width, positions[resting], radius[resting])
+        blocked = _meets_resting(flat[waiting], offset, width, flat[resting], radius[resting])
         if walls:
+            offset = path[result[waiting], waiting] - positions[waiting]
+            width = wall_radius[waiting] + problem.margin / 2
             points = positions[waiting] + _SHARES[:, None, None] * offset
             clearance = problem.world.clearance(points.reshape(-1, points.shape[-1])).reshape(points.shape[:-1])
             blocked |= (clearance <= width).any(axis=0)
@@ -279,7 +283,7 @@ def _discs_first(
     Footprints are planned one after another (:mod:`d4orm_planners.manoeuvres`), and the last ones come late.
     """
     team = coarse.team
-    if team.shapes and covered_by_discs(coarse):
+    if team.shapes and team.dimension == 2 and covered_by_discs(coarse):
         chosen, plan = search(coarse.with_state(coarse.start, coarse.goal, team=team.replace(radius=team.radius)))
         if not chosen.failed.any():
             return chosen, plan

@@ -214,8 +214,9 @@ class CoarsePlanTracker:
         robots, barred = np.flatnonzero(asked & ~arrived), np.zeros_like(arrived)
         path, ahead = self.guidance.path, np.arange(self._config.subgoal_offset + 1)
         waypoints = path[np.minimum(self._indices[robots] + ahead[:, None], len(path) - 1), robots]
-        away = np.linalg.norm(waypoints[:, :, None] - joint.states[arrived, : self.problem.dimension], axis=3)
-        radius = np.asarray(self.problem.team.radius)
+        team, resting = self.problem.team, joint.states[arrived, : self.problem.dimension]
+        waypoints, resting = (team.flattened(at, 0.0) for at in (waypoints, resting))
+        away, radius = np.linalg.norm(waypoints[:, :, None] - resting, axis=3), np.asarray(team.girth)
         barred[robots] = (away < radius[robots, None] + radius[arrived]).any(axis=(0, 2))
         return barred
 

@@ -148,11 +148,15 @@ def approach_by_manoeuvres(
 
 def _keeps_clear(window: Problem, positions: FloatArray, robots: IntArray, arrived: BoolArray) -> BoolArray:
     """``(R, V)`` bool: paths ``(T, R, V, d)`` that keep the margin to all at rest, or come no nearer than at first."""
-    radius = np.asarray(window.team.radius, np.float64)
-    room = window.world.clearance(positions) - radius[robots, None]
+    team = window.team
+    radius, wall_radius = np.asarray(team.girth, np.float64), np.asarray(team.wall_radius, np.float64)
+    room = window.world.clearance(positions) - wall_radius[robots, None]
     clear = _no_nearer(room, window)
     if arrived.any():
-        away = np.linalg.norm(positions[:, :, :, None] - window.start[arrived, : window.dimension], axis=4)
+        positions, resting = (
+            team.flattened(at, window.margin) for at in (positions, window.start[arrived, : window.dimension])
+        )
+        away = np.linalg.norm(positions[:, :, :, None] - resting, axis=4)
         clear &= _no_nearer(away - radius[robots, None, None] - radius[arrived], window).all(axis=2)
     return clear
 

@@ -207,7 +207,7 @@ class Window:
 
         That is within the margin; of half of it for those that are stuck; nearer than now for those within it already.
         """
-        trajectory, radius = self._engine.rollout(window, controls), np.asarray(window.team.radius)
+        trajectory, radius = self._engine.rollout(window, controls), np.asarray(window.team.wall_radius)
         violated: BoolArray = np.any(trajectory.margin_violated[1:], axis=0)
         lenient = trajectory.margin_violated[0] | now.stuck
         if lenient.any():
@@ -224,7 +224,7 @@ class Window:
         if bodies is None:
             return np.zeros(self.problem.num_robots, bool)
         away = np.linalg.norm(trajectory.positions[1:, :, None] - bodies.positions[:, None], axis=3)
-        safety_distance = np.asarray(self.problem.team.radius)[:, None] + bodies.radius + margin
+        safety_distance = np.asarray(self.problem.team.wall_radius)[:, None] + bodies.radius + margin
         return (away <= safety_distance).any(axis=(0, 2))
 
     def touching(self, joint: JointState, arrived: BoolArray, controls: FloatArray, gap: float) -> BoolArray:
@@ -239,8 +239,8 @@ class Window:
 
 
 def least_gap(problem: Problem, positions: FloatArray) -> float:
-    """Least gap between the surfaces of any two robots on ``(T, K, d)`` [m]."""
-    radius = np.asarray(problem.team.radius)
+    """Least gap between the surfaces of any two robots on ``(T, K, d)``, or less [m]."""
+    radius, positions = np.asarray(problem.team.girth), problem.team.flattened(positions, 0.0)
     first, second = np.triu_indices(problem.num_robots, 1)
     if not len(first):
         return float("inf")

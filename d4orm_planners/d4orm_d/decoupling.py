@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
-from d4orm_planners.base.candidate import Graph, Groups, components, conflicts
+from d4orm_planners.base.candidate import Graph, Groups, components, team_conflicts
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_d.repairs import DeformedPlan
@@ -83,7 +83,7 @@ class GroupRuns:
 def grouping_of(search: SolveRun, previous: Grouping | None) -> Grouping:
     """Return the groups of the present candidate, at the steps that are checked."""
     problem, positions = search.problem, search.current.trajectory.positions
-    graph = conflicts(positions[:: search.check_interval], problem.team.radius, problem.margin)
+    graph = team_conflicts(problem, positions[:: search.check_interval])
     return regrouped(graph, previous)
 
 

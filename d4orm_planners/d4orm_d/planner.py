@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_planners.base.candidate import conflicts
+from d4orm_planners.base.candidate import team_conflicts
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.settings import CheckedSettings, Count, NotNegative, Positive, Samples, Steps, one_of
 from d4orm_planners.base.solve import SolveRun
@@ -187,5 +187,5 @@ class D4ormD(DeformingPlanner):
 def straight_if_sparse(problem: Problem) -> FloatArray | None:
     """Controls ``(H, K, m)`` straight to the goals; ``None`` where robots would meet half of the others on average."""
     drives = straight_drives(problem)
-    graph = conflicts(drives.positions[:, :, 0], problem.team.radius, problem.margin)
+    graph = team_conflicts(problem, drives.positions[:, :, 0])
     return None if 2 * sum(map(len, graph)) >= problem.num_robots**2 else drives.controls[:, :, 0]

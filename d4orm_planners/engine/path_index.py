@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, Ints, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.core.team import Team
 from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, WITHOUT_ARRAYS, inlined
@@ -33,21 +34,22 @@ class PathIndex:
         positions: ``(H+1, K, d)`` [m], finite; copied. At the start none counts as near.
         radius: ``(K,)`` [m].
         margin: Gap that robots are to keep between them [m].
+        flattening: Factor for heights by which balls of these radii stand for the robots.
 
     Attributes:
         table: The index as kernels read it.
     """
 
-    def __init__(self, positions: FloatArray, radius: ArrayLike, margin: float) -> None:
+    def __init__(self, positions: FloatArray, radius: ArrayLike, margin: float, flattening: float = 1.0) -> None:
         positions = np.array(positions, np.float32, order="C")
         num_robots, num_blocks = positions.shape[1], -(-(len(positions) - 1) // BLOCK)
         radii = np.array(radius, np.float64)
-        safety_distance = 2 * radii.max() + margin
+        safety_distance = (2 * radii.max() + margin) / flattening
         # Robots as near to each other as they may be are about one in a cell.
         scale = 1 / (2 * safety_distance)
         self.table = PathTable(
             BLOCK, positions, np.zeros((num_blocks, num_robots, BLOCK, positions.shape[2]), np.float32), radii,
-            np.float64(margin), np.float64(safety_distance), np.float64(scale),
+            np.float64(margin), np.float64(safety_distance), np.float64(scale), np.float64(flattening),
             np.zeros((num_blocks, num_robots, 3)), np.zeros((num_blocks, num_robots)),
             np.zeros(1), np.zeros(1, np.int64),
             np.full((num_blocks, 1 << (2 * num_robots - 1).bit_length()), NOBODY),
@@ -89,6 +91,11 @@ class PathIndex:
 
         self._threads.over(len(index), count)
         return counts, when
+
+
+def team_index(team: Team, positions: FloatArray, margin: float) -> PathIndex:
+    """The index of a team's paths ``(H+1, K, d)``; see :meth:`Team.flattening`."""
+    return PathIndex(positions, team.girth, margin, team.flattening(margin))
 
 
 @cached_kernel(**WITHOUT_ARRAYS)
@@ -224,7 +231,7 @@ def _check_alone(
     arrays = borrow(arrays)
     dimension, closed, never = arrays.goal.shape[1], is_closed(arrays), paths.shape[2]
     for r in range(robot_range[0], robot_range[1]):
-        safety_distance, goal = arrays.radius[robots[r]] + arrays.margin, arrays.goal[robots[r]]
+        safety_distance, goal = arrays.wall_radius[robots[r]] + arrays.margin, arrays.goal[robots[r]]
         for v in range(paths.shape[1]):
             path, last, touching, unsure = paths[r, v], never - 1, never, never
             while last > 0 and _is_same_position(path, dimension, last):

@@ -32,6 +32,7 @@ class PathTable(NamedTuple):
     margin: np.float64  #: ``()`` float64 [m]
     safety_distance: np.float64  #: ``()`` float64 the largest distance at which two robots are near [m]
     scale: np.float64  #: ``()`` float64 cells in a metre
+    flattening: np.float64  #: ``()`` float64 factor for heights by which robots are near where balls are
     middle: Floats  #: ``(B, K, 3)`` float64 where each robot is in each block, more or less [m],
     spread: Floats  #: ``(B, K)`` float64 and how far from there it gets [m]
     widest: Floats  #: ``(1,)`` float64 the largest spread there has been
@@ -130,7 +131,7 @@ def first_near(
     safety_distance = table.radius[robot] + table.radius[other] + table.margin
     x, y, z = table.middle[block, other]
     x, y, z = x - middle[0], y - middle[1], z - middle[2]
-    far = _WIDER * (safety_distance + spread + table.spread[block, other])
+    far = _WIDER * (safety_distance / table.flattening + spread + table.spread[block, other])
     if x * x + y * y + z * z > far * far:
         return 0
     return _first_step(table, safety_distance, path, begin, block, other)
@@ -146,6 +147,7 @@ def _first_step(
         gap2 = 0.0
         for axis in range(table.blocks.shape[3]):
             gap = np.float64(path[t - begin, axis]) - np.float64(table.blocks[block, other, t - first, axis])
+            gap *= table.flattening if axis == 2 else 1.0
             gap2 += gap * gap
         if gap2 <= safety_distance * safety_distance:
             return t
@@ -228,7 +230,7 @@ def find_nearby(table: PathTable, robot: Whole, exclude: IntArray, box: Box, blo
     # All in a row: that takes less time than a few buckets.
     for other in range(table.middle.shape[1]):
         x, y, z = table.middle[block, other]
-        far = _WIDER * (own + table.radius[other] + table.spread[block, other])
+        far = _WIDER * ((own + table.radius[other]) / table.flattening + table.spread[block, other])
         nearby.robots[count] = other
         count += (
             (x >= low_x - far)
@@ -244,7 +246,7 @@ def find_nearby(table: PathTable, robot: Whole, exclude: IntArray, box: Box, blo
         if not _is_among(other, exclude):
             kept = nearby.found[0]
             nearby.robots[kept], nearby.buckets[kept] = other, _own_bucket(table, block, other)
-            nearby.reach[kept] = own + table.radius[other] + table.spread[block, other]
+            nearby.reach[kept] = (own + table.radius[other]) / table.flattening + table.spread[block, other]
             for axis in range(3):
                 nearby.middle[kept, axis] = table.middle[block, other, axis]
             nearby.found[0] = kept + 1

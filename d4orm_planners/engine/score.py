@@ -113,7 +113,7 @@ def _punish_static(
     scratch: Scratch, w: FloatArray,
 ) -> None:  # fmt: skip
     """Take the penalty from robot ``k`` where it is near an obstacle or the bounds; ``rest`` times more at the end."""
-    radius, margin, dimension, buffer = arrays.radius[k], arrays.margin, arrays.goal.shape[1], scratch.buffer
+    radius, margin, dimension, buffer = arrays.wall_radius[k], arrays.margin, arrays.goal.shape[1], scratch.buffer
     if not near_static(arrays, k, scoring.bounds, scratch.boxes, buffer):
         return
     for step in range(count):

@@ -22,7 +22,7 @@ from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.cpu_sampling import Sampling
-from d4orm_planners.engine.path_index import PathIndex, check_alone
+from d4orm_planners.engine.path_index import check_alone, team_index
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
 from d4orm_planners.engine.score import score_kernel
 from d4orm_planners.hybrid.planner import Hybrid
@@ -105,7 +105,7 @@ def index_paths(models: tuple[str, ...]) -> None:
     problem = smallest_problem(models)
     prepare_drives(problem)
     states, robots = at_rest(problem)[0], np.arange(problem.num_robots)
-    index = PathIndex(states[..., : problem.dimension], problem.team.radius, problem.margin)
+    index = team_index(problem.team, states[..., : problem.dimension], problem.margin)
     paths = states.swapaxes(0, 1)[:, None]
     check_alone(problem.arrays, robots, paths)
     index.count_meetings(robots, paths)

@@ -93,7 +93,7 @@ def _reroute_pair(team: WorkingPlan, pair: IntArray, primitives: MotionPrimitive
     Where they face each other at the start, replanning one of them does not help while the other comes on.
     """
     problem = team.problem
-    faults, radius = team.faults(pair)[0].sum(), np.asarray(problem.team.radius, np.float64)
+    faults, radius = team.faults(pair)[0].sum(), np.asarray(problem.team.girth, np.float64)
     present = team.controls[:, pair], team.states[:, pair], team.arrived[pair]
     for first, second in (pair, pair[::-1]):
         # The second one stays where it is as long as the first may need to get away.

@@ -178,6 +178,7 @@ def _count_extra(
             for axis in range(path.shape[1]):
                 position = np.float64(path[min(t - first, end), axis])
                 gap = position - np.float64(others.extra[r, other, t, axis])
+                gap *= table.flattening if axis == 2 else 1.0
                 gap2 += gap * gap
             if gap2 <= safety_distance * safety_distance:
                 count += 1

@@ -204,7 +204,7 @@ def count_faults(arrays: ProblemArrays, robot: Whole, steps: Whole, end: Whole, 
     """Count in robots met what a path ``(BLOCK, d)`` does wrong by itself in a block of so many steps, in which it
     moves until ``end``.
     """
-    goal, safety_distance, faults = arrays.goal[robot], arrays.radius[robot] + arrays.margin, 0.0
+    goal, safety_distance, faults = arrays.goal[robot], arrays.wall_radius[robot] + arrays.margin, 0.0
     closed, near = is_closed(arrays), _comes_near(arrays, goal, path, steps)
     if not (closed or near):
         return faults

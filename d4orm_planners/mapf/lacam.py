@@ -66,11 +66,11 @@ class TeamOnRoadmap:
 
     def __init__(self, problem: Problem, roadmap: Roadmap) -> None:
         self.roadmap, num_robots, num_nodes = roadmap, problem.num_robots, len(roadmap.nodes)
-        radius = np.asarray(problem.team.radius, np.float64)
+        radius, wall_radius = (np.asarray(of, np.float64) for of in (problem.team.girth, problem.team.wall_radius))
         self.bodies = RobotArrays(
             radius=radius,
             size=problem.team.largest_radius,
-            safety_distance=radius * (1 - ROUNDING) + problem.margin,
+            safety_distance=wall_radius * (1 - ROUNDING) + problem.margin,
             margin=float(problem.margin),
             slack=PAIR_SLACK * problem.team.largest_radius,
             goal_radius=float(problem.goal_radius),

@@ -220,7 +220,7 @@ class _Motions:
             others = OtherAgents(
                 groups[found],
                 np.ascontiguousarray(np.moveaxis(states[:, found, :member, : self.problem.dimension], 0, 2)),
-                np.asarray(self.problem.team.radius, np.float64)[before],
+                np.asarray(self.problem.team.girth, np.float64)[before],
             )
             rules = BeamRules(WIDTH, CONTACT, DEDUP_DISTANCE * self.problem.team.largest_radius)
             paths = find_paths(self.team, robots, blocks[found], primitives, rules, limits, others)

@@ -5,6 +5,7 @@ What every search needs of a robot's motion is worked out once: its boxes in blo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ EVER = 1 << 30
 class Others(NamedTuple):
     """Motions of all robots around one."""
 
-    positions: Floats  #: ``(K, T + 1, 3)`` float64; afterwards they stay where they are [m]
+    positions: Floats  #: ``(K, T + 1, 3)`` float64, flattened; afterwards they stay where they are [m]
     #: ``(K,)`` how far the robot that is replanned keeps from each [m]; zero from whom it does not mind, and from
     #: itself
     need: Floats
@@ -43,13 +44,14 @@ class Occupancy:
     Args:
         cells: The nodes.
         positions: ``(T + 1, K, 3)`` float64 [m]; not copied.
+        flatten: What is done to positions before distances are measured; see :meth:`Team.flattened`.
     """
 
-    def __init__(self, cells: Cells, positions: Floats) -> None:
+    def __init__(self, cells: Cells, positions: Floats, flatten: Callable[[Floats], Floats]) -> None:
         rows, num_robots, _ = positions.shape
-        self._cells, self.positions = cells, positions
+        self._cells, self.positions, self._flatten = cells, positions, flatten
         # Searches look at a robot at many steps in turn.
-        self._paths = np.ascontiguousarray(positions.swapaxes(0, 1))
+        self._paths = np.ascontiguousarray(flatten(positions).swapaxes(0, 1))
         self._boxes = np.empty((-(-rows // BLOCK), num_robots, 6))
         self._visits, self._counts = np.empty((num_robots, 64, 3), np.int32), np.zeros(num_robots, np.int64)
         self._known = np.zeros(num_robots)
@@ -57,7 +59,7 @@ class Occupancy:
     def put(self, robots: IntArray | BoolArray | int, positions: Floats | float) -> None:
         """Let robots, by number or mask, move otherwise: ``(T + 1, 3)`` or ``(T + 1, R, 3)`` positions [m]."""
         self.positions[:, robots] = positions
-        self._paths[robots] = self.positions[:, robots].swapaxes(0, -2)
+        self._paths[robots] = self._flatten(self.positions[:, robots]).swapaxes(0, -2)
         self._known[robots] = 0.0
 
     def around(self, need: Floats) -> Others:

@@ -77,7 +77,10 @@ class _Settled:
         should_stop: Callable[[], bool],
     ) -> None:
         self.replanning, self.driven, self.random, self.should_stop = replanning, driven, random, should_stop
-        self.occupancy, self.steps = Occupancy(replanning.cells, driven.positions), len(driven.controls)
+        self.occupancy, self.steps = (
+            Occupancy(replanning.cells, driven.positions, replanning.flatten),
+            len(driven.controls),
+        )
         self.settled = np.ones(replanning.problem.num_robots, bool)
         self.leisure = 0  #: steps that robots leave others to set out, at most
 
@@ -99,7 +102,7 @@ class _Settled:
         others = self.occupancy.around(replanning.separation(robot, KEEP))
         others, met = others._replace(need=replanning.separation(robot, TOUCH)), np.ones(len(settled), bool)
         last = replanning.leaves(int(self.driven.arrivals[robot]))
-        find_meetings(others, np.ascontiguousarray(self.driven.positions[:last, robot]), met)
+        find_meetings(others, np.ascontiguousarray(replanning.flatten(self.driven.positions[:last, robot])), met)
         displaced = np.flatnonzero(settled & met)
         settled[robot] = True
         return displaced

@@ -85,7 +85,7 @@ def _blocking_robot(
     roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, positions: IntArray, k: Whole, e: Whole, depth: Whole
 ) -> Whole:
     """The first robot that has to yield before ``k`` takes an edge; -1 for none, -2 where that cannot be."""
-    nodes, head, at = roadmap.nodes, np.int64(roadmap.heads[e]), positions[k]
+    nodes, head, at = roadmap.flat, np.int64(roadmap.heads[e]), positions[k]
     found: Whole = np.int64(-1)
     for number in range(roadmap.near_first[e], roadmap.near_first[e + 1]):
         u = np.int64(roadmap.near[number])

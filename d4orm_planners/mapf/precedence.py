@@ -64,9 +64,9 @@ def join_routes(problem: Problem, routes: Sequence[Route]) -> Routes:
     first = np.append(0, np.cumsum([len(route.times) for route in routes])).astype(np.int64)
     arcs = np.append(0.0, np.cumsum(_lengths(np.diff(points, axis=0))))
     arcs -= np.repeat(arcs[first[:-1]], np.diff(first))
-    radius = np.asarray(problem.team.radius, np.float64)
+    radius = np.asarray(problem.team.girth, np.float64)
     separation = problem.margin + WAIT_SLACK * problem.team.largest_radius
-    cells = sort_into_cells(points, 2 * float(radius.max()) + separation)
+    cells = sort_into_cells(problem.team.flattened(points, problem.margin), 2 * float(radius.max()) + separation)
     return Routes(points, times, bends, first, arcs, *_find_waits(cells, first, times, radius, separation))
 
 
@@ -131,7 +131,7 @@ def _fits(problem: Problem, bends: RouteBends, radius: Floats, owner: IntArray) 
     fits = np.ones(radius.shape, bool)
     if problem.world.num_obstacles:
         slack = ARC_SLACK * problem.team.largest_radius
-        safety_distance = np.asarray(problem.team.radius, np.float64)[owner] + problem.margin + slack
+        safety_distance = np.asarray(problem.team.wall_radius, np.float64)[owner] + problem.margin + slack
         repeated = RouteBends(*(np.concatenate([values] * len(radius)) for values in bends))
         arcs = _arcs(repeated, radius.ravel(), ARC_CHECKS)[..., : problem.dimension]
         arcs = arcs.reshape(*radius.shape, *arcs.shape[1:])

@@ -121,7 +121,7 @@ def _follow_edge(
     """Enter whatever is come to from an entry by an edge, see :func:`_departure`."""
     reservations, entries, head, failures = search.reservations, tree.entries, np.int64(roadmap.heads[e]), 0
     node, depart, above = entries[entry, 0], entries[entry, 2], entries[entry, 3]
-    tail, to = roadmap.nodes[node], roadmap.nodes[head]
+    tail, to = roadmap.flat[node], roadmap.flat[head]
     steps = np.int64(np.ceil(roadmap.lengths[e] / trip.stride))
     turn = steps_to_turn(roadmap.nodes, trip, entries[above, 0] if above >= 0 else above, node, head)
     arrival = interval_at(reservations.safe, head, depart + turn + steps)
@@ -164,7 +164,7 @@ def _soonest(roadmap: Roadmap, bodies: RobotArrays, reservations: Reservations, 
     others, buckets, goal, until = reservations.others, reservations.buckets, bodies.goals[k], reservations.dock + 1
     while until <= trip.latest:
         for e in range(roadmap.first[goal], roadmap.first[goal + 1]):
-            tail, head = roadmap.nodes[np.int64(roadmap.heads[e])], roadmap.nodes[goal]
+            tail, head = roadmap.flat[np.int64(roadmap.heads[e])], roadmap.flat[goal]
             steps = np.int64(np.ceil(roadmap.lengths[e] / trip.stride))
             for depart in (until - steps, until - steps - trip.launch):
                 if depart >= 0 and first_meeting(others, buckets, tail, head, depart, until)[0] < 0:

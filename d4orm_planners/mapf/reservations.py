@@ -146,7 +146,7 @@ def straighten(
     nodes, goal, arrived, count, i = roadmap.nodes, bodies.goals[k], bodies.goal_radius + bodies.slack, 1, 0
     while i + 1 < path.shape[0]:
         j = i + 1
-        depart, tail = path[j, 1], nodes[path[i, 0]]
+        depart, tail, flat_tail = path[j, 1], nodes[path[i, 0]], roadmap.flat[path[i, 0]]
         before = path[count - 2, 0] if count > 1 else np.int64(-1)
         while j + 1 < path.shape[0]:
             head = nodes[path[j + 1, 0]]
@@ -158,7 +158,9 @@ def straighten(
                 if not is_free_line(space, safety_distance, tail, head):
                     break
             first = depart + steps_to_turn(nodes, trip, before, path[i, 0], path[j + 1, 0])
-            if first >= path[j + 1, 2] or not _is_line_free(others, tail, head, first, path[j + 1, 2]):
+            if first >= path[j + 1, 2] or not _is_line_free(
+                others, flat_tail, roadmap.flat[path[j + 1, 0]], first, path[j + 1, 2]
+            ):
                 break
             j += 1
         path[count, 0], path[count, 1], path[count, 2] = path[j, 0], depart, path[j, 2]
@@ -257,6 +259,6 @@ def make_reservations(
     goal = bodies.goals[k]
     # Nobody may come near its goal once it stands there for good.
     dock = last_visit(others, goal) if stays else np.int64(-1)
-    buckets = sort_boxes(others, roadmap.nodes, roadmap.lengths.max() / 2, latest // BLOCK + 1)
+    buckets = sort_boxes(others, roadmap.flat, roadmap.lengths.max() / 2, latest // BLOCK + 1)
     safe = free_intervals(others, roadmap.starts[k], roadmap.nodes.shape[0], latest + 1)
     return Reservations(others, buckets, safe, dock)

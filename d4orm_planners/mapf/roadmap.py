@@ -39,6 +39,7 @@ class Roadmap(NamedTuple):
     """Positions and the straight lines between them on which a robot keeps clear of obstacles."""
 
     nodes: Floats  #: ``(N, 3)`` float64 positions [m]
+    flat: Floats  #: The same as others see them; see :meth:`Team.flattened`
     first: IntArray  #: ``(N + 1,)`` int64 where the edges from each begin
     heads: Ints  #: ``(E,)`` int32 where each edge leads
     lengths: Floats  #: ``(E,)`` float64 [m]
@@ -57,9 +58,9 @@ def lay_roadmap(problem: Problem, fineness: float = 1.0, *, narrow: bool = False
     nearer at most: in large worlds they are farther apart. If ``narrow``, robots' own shortest paths are part of it,
     however narrow the gaps that they lead through.
     """
-    d, radius = problem.dimension, np.asarray(problem.team.radius, np.float64)
-    spread = 2 * radius.max() + problem.margin + PAIR_SLACK * problem.team.largest_radius
-    safety_distances = np.unique(radius + problem.margin)
+    d, team = problem.dimension, problem.team
+    spread = 2 * float(team.girth.max()) + problem.margin + PAIR_SLACK * team.largest_radius
+    safety_distances = np.unique(np.asarray(team.wall_radius, np.float64) + problem.margin)
     space = make_space(problem) if problem.world.num_obstacles else None
     ends = np.unique(in_space(np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)), axis=0)
     fineness = min(fineness, FINEST_IN_SPACE) if d == 3 else fineness
@@ -85,12 +86,14 @@ def _assembled(
     order = np.lexsort((heads, tails))
     tails, heads, room = tails[order], heads[order], np.concatenate([room, room])[order]
     first = np.searchsorted(tails, np.arange(len(nodes) + 1)).astype(np.int64)
-    near_first, near = find_near(sort_into_cells(nodes, distance), nodes[tails], nodes[heads], distance)
+    flat = problem.team.flattened(nodes, problem.margin)
+    near_first, near = find_near(sort_into_cells(flat, distance), flat[tails], flat[heads], distance)
     gaps = np.empty(len(near))
-    measure_gaps(nodes, tails, heads, near_first, near, gaps)
+    measure_gaps(flat, tails, heads, near_first, near, gaps)
     d = problem.dimension
     return Roadmap(
         nodes=nodes,
+        flat=flat,
         first=first,
         heads=heads.astype(np.int32),
         lengths=np.sqrt(((nodes[heads] - nodes[tails]) ** 2).sum(axis=1)),
@@ -132,7 +135,7 @@ def _along_paths(problem: Problem, step: float) -> Floats:
             shares = np.linspace(0, 1, 2 + int(2 * np.sqrt(((head - tail) ** 2).sum()) / step))
             lines.append(tail + shares[:, None] * (head - tail))
     points = np.concatenate(lines)
-    wanted = float(np.asarray(problem.team.radius).max() + problem.margin) * (1 + WALL_SLACK)
+    wanted = float(np.asarray(problem.team.wall_radius).max() + problem.margin) * (1 + WALL_SLACK)
     for push in np.cumprod(np.full(PUSHES, DAMPING)):
         near = (world.clearance(points + probe) - world.clearance(points - probe) for probe in np.eye(d) * step / 64)
         gradient = np.stack(list(near), axis=1)
@@ -192,9 +195,9 @@ def passes_too_near(
     if gap >= need:
         return False
     if tail == bodies.starts[k] or tail == bodies.goals[k]:
-        need = min(need, _gap(roadmap.nodes, u, tail))
+        need = min(need, _gap(roadmap.flat, u, tail))
     if head == bodies.goals[k]:
-        need = min(need, max(_gap(roadmap.nodes, u, head), hard))
+        need = min(need, max(_gap(roadmap.flat, u, head), hard))
     return gap < need - ROUNDING * bodies.size
 
 

@@ -99,14 +99,16 @@ class Replanning:
 
     def __init__(self, problem: Problem, roadmap: Roadmap, dwell: int | None = None) -> None:
         self.problem, self.roadmap, self.dwell = problem, roadmap, dwell
-        self.cells = sort_into_cells(roadmap.nodes, float(2 * np.asarray(problem.team.radius).max() + problem.margin))
+        self.cells = sort_into_cells(roadmap.flat, float(2 * np.asarray(problem.team.girth).max() + problem.margin))
         self.space = make_space(problem) if problem.world.num_obstacles else None
         self.bodies, self.size = TeamOnRoadmap(problem, roadmap).bodies, problem.team.largest_radius
         speed, acceleration = np.asarray(problem.team.limits, np.float64)[:, [SPEED, ACCELERATION]].T
         self.strides = problem.dt * speed
         self.launch = np.round(LAUNCH * speed / acceleration / problem.dt).astype(np.int64)
-        positions = [roadmap.nodes[ends] for ends in (roadmap.starts, roadmap.goals)]
-        gaps = [np.sqrt(((ends[:, None] - ends) ** 2).sum(axis=2)) for ends in positions]
+        positions, flat = (
+            [nodes[ends] for ends in (roadmap.starts, roadmap.goals)] for nodes in (roadmap.nodes, roadmap.flat)
+        )
+        gaps = [np.sqrt(((ends[:, None] - ends) ** 2).sum(axis=2)) for ends in flat]
         self.ends_apart = np.minimum(gaps[0], gaps[1] - self.bodies.goal_radius) - ROUNDING * self.size
         # Who turns in place need not back up.
         self.backing = [(False,) if model.turns_in_place else (False, True) for model in problem.team.robot_models]
@@ -124,13 +126,17 @@ class Replanning:
         changed = TeamRollout(
             driven.controls[:last].copy(), driven.positions[: last + 1].copy(), driven.arrivals.copy()
         )
-        occupancy = Occupancy(self.cells, changed.positions)
+        occupancy = Occupancy(self.cells, changed.positions, self.flatten)
         occupancy.put(robots, FAR)
         latest = np.minimum(driven.arrivals + LATER, last)
         for robot in robots.tolist():
             if should_stop() or not self.replan_one(changed, occupancy, robot, int(latest[robot]), random):
                 return None
         return changed
+
+    def flatten(self, positions: Floats) -> Floats:
+        """Positions ``(..., 3)`` as others see them; see :meth:`Team.flattened`."""
+        return self.problem.team.flattened(positions, self.problem.margin)
 
     def leaves(self, arrival: int) -> int | None:
         """The step from which on a robot that arrives at a step is no obstacle any more, if any."""
@@ -235,7 +241,7 @@ class Replanning:
         if arrival > latest:
             return -np.inf
         touch, met = np.minimum(self.separation(robot, TOUCH), others.need), np.empty(len(others.need), bool)
-        find_meetings(others._replace(need=touch), positions[: self.leaves(arrival)], met)
+        find_meetings(others._replace(need=touch), self.flatten(positions[: self.leaves(arrival)]), met)
         if met.any():
             return -np.inf
         if self.space is None:

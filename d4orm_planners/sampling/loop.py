@@ -20,7 +20,7 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.team import Team
-from d4orm_planners.base.candidate import Groups, components, conflicts
+from d4orm_planners.base.candidate import Groups, components, team_conflicts
 from d4orm_planners.base.planner import Iteration, Planner, State
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan, approach_goals
@@ -175,7 +175,7 @@ def conflict_groups(search: SolveRun) -> Groups:
     """Groups of robots that conflict with each other in the present candidate, directly or through others."""
     problem = search.problem
     positions = search.current.trajectory.positions
-    return components(conflicts(positions, problem.team.radius, problem.margin))
+    return components(team_conflicts(problem, positions))
 
 
 class DenoisingPlanner(SamplingPlanner):
