@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
+
+import numpy as np
 
 from d4orm_env.core.arrays import truth, whole_number
 from d4orm_env.core.errors import unknown
@@ -36,18 +39,25 @@ class RobotType:
     max_turn_rate: float = 1.0  #: [rad/s]; of no use to models without a heading
     margin: float  #: Distance for what tracking is off [m]
     lag: float  #: Time constant of its actuators [s], for :class:`~d4orm_planners.base.controller.Controller`
-    downwash: float = 0.0  #: Half the height of an ellipsoid in whose like no other may be, above or below it [m]
+    downwash: float = 0.0  #: Half the height of the ellipsoid that others of its kind stay out of; zero for none [m]
     sources: Mapping[str, str]  #: Where the numbers come from, by attribute
 
-    def settings(self, downwash: object = False) -> dict[str, object]:
-        """Arguments of scenarios for a team of these, as balls or with room for their downwash."""
-        if truth(downwash, "downwash") and not self.downwash:
+    def settings(self, downwash: object = None, radius: Any = None) -> dict[str, object]:
+        """Arguments of scenarios for a team of these: as balls, or with room for their downwash by default if they have
+        one; and of another ``radius``, if given.
+        """
+        if downwash is not None and truth(downwash, "downwash") and not self.downwash:
             raise ValueError("downwash is True, and this robot has none; leave it out, or choose a drone as robot")
         names = ("model", "max_speed", "max_acceleration", "max_turn_rate", "margin", "lag")
-        size = (
-            {"footprint": Ellipsoid(self.radius, self.radius, self.downwash)} if downwash else {"radius": self.radius}
-        )
-        return {name: getattr(self, name) for name in names} | size
+        settings, radius = {name: getattr(self, name) for name in names}, self.radius if radius is None else radius
+        if not self.downwash or downwash is False:
+            return settings | {"radius": radius}
+        shapes = [Ellipsoid(size, size, self._reach(size), size) for size in (radius if np.ndim(radius) else [radius])]
+        return settings | {"footprint": shapes if np.ndim(radius) else shapes[0]}
+
+    def _reach(self, radius: Any) -> Any:
+        """Half the height of an ellipsoid of that radius: no less."""
+        return max(radius, self.downwash) if isinstance(radius, int | float | np.floating) else self.downwash
 
 
 def _robot(model: str, **numbers: tuple[float, str]) -> RobotType:
@@ -112,7 +122,7 @@ def find_robot(name: str) -> RobotType:
     return ROBOTS[name]
 
 
-def make_team(name: str, num_robots: int, *, downwash: bool = False) -> Team:
+def make_team(name: str, num_robots: int, *, downwash: bool | None = None) -> Team:
     """A team of robots that can be bought, as :data:`ROBOTS` has them; scenarios take ``robot=name``.
 
     Its problems have their margin by default, and controllers their lag.
@@ -120,7 +130,8 @@ def make_team(name: str, num_robots: int, *, downwash: bool = False) -> Team:
     Args:
         name: ``"crazyflie"``, ``"crazyflie_brushless"``, ``"turtlebot3_burger"``, ``"robomaster"`` or ``"jackal"``.
         num_robots: ``K``.
-        downwash: Whether drones are ellipsoids that keep others out of the air below them, in place of balls.
+        downwash: Whether they are ellipsoids to each other, which keep others out of the air below them, and balls to
+            all else; by default drones are. ``False`` makes them balls.
 
     Raises:
         ValueError: If there is no such robot, it has no downwash, or the number is not positive.

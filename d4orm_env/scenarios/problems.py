@@ -172,10 +172,14 @@ def _generate(
 ) -> Problem:  # fmt: skip
     arguments = {name: settings.pop(name) for name in own if name in settings}
     size = {} if num_robots is None else {"num_robots": num_robots}
-    robot, downwash = settings.pop("robot", None), settings.pop("downwash", False)
-    if robot is None and downwash:
+    robot, downwash = settings.pop("robot", None), settings.pop("downwash", None)
+    if robot is None and downwash is not None:
         raise ValueError("downwash is of robots by name; give robot, as 'crazyflie', or a footprint")
-    team = {} if robot is None else find_robot(robot).settings(downwash)
+    team = {}
+    if robot is not None:
+        # Another radius is that of its body, and another footprint takes the place of both.
+        radius = None if "footprint" in settings else settings.pop("radius", None)
+        team = find_robot(robot).settings(downwash, radius)
     common = {**defaults, **team, **size, **settings}
     if "footprint" in common:  # the radius follows
         common["radius"] = settings.get("radius")

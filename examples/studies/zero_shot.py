@@ -114,7 +114,7 @@ def fly(scenario: str, condition: str, seed: int) -> dict[str, Any]:
         "contacts": int((touched & ~record.fallen).sum()),
         "mean_squared_error": float(record.mean_squared_error.mean()), "error": float(record.largest_error.max()),
         "gap": float(record.least_gap.min()), "clearance": float(record.least_clearance.min()),
-        "radius": float(problem.team.radius[0]), "seconds": record.samples / RATE, **denoising,
+        "radius": float(problem.team.wall_radius[0]), "seconds": record.samples / RATE, **denoising,
         "loop_steps": loop_steps,
     }  # fmt: skip
 
