@@ -173,7 +173,7 @@ def _generate(
     arguments = {name: settings.pop(name) for name in own if name in settings}
     size = {} if num_robots is None else {"num_robots": num_robots}
     robot, downwash = settings.pop("robot", None), settings.pop("downwash", None)
-    if robot is None and downwash is not None:
+    if robot is None and downwash:
         raise ValueError("downwash is of robots by name; give robot, as 'crazyflie', or a footprint")
     team = {}
     if robot is not None:

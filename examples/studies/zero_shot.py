@@ -39,14 +39,14 @@ CALM = 10
 
 
 def figure(seed: int) -> Problem:
-    """Ten drones from a grid above the floor to two rings one above the other."""
+    """Ten drones from a grid above the floor to two rings one above the other, with room for the downwash."""
     angles = 2 * np.pi * np.arange(5) / 5
     rings = [np.stack([0.5 * np.sin(angles), 0 * angles, z + side * 0.5 * np.cos(angles)], axis=1)
-             for z, side in ((1.0, -1), (2.3, 1))]  # fmt: skip
+             for z, side in ((0.95, -1), (2.4, 1))]  # fmt: skip
     grid = [[0.6 * x, 0.6 * y, 0.5, 0, 0, 0] for x in range(-2, 3) for y in (-1, 0)]
     goals = np.random.default_rng(seed).permutation(np.concatenate(rings))
     return make_problem(
-        "circle", 10, robot=ROBOT, height=1.0, horizon=HORIZON, bounds=[[-3, -3, 0.2], [3, 3, 3]]
+        "circle", 10, robot=ROBOT, height=1.0, horizon=HORIZON, bounds=[[-3, -3, 0.2], [3, 3, 3.2]]
     ).replace(start=grid, goal=goals, name="figure")
 
 
