@@ -189,15 +189,13 @@ def _free_position(
 ) -> FloatArray:
     """``(d,)`` a random position with room for a robot of the first one's size among ``taken`` ``(N, d or more)``."""
     others = np.asarray(taken, np.float32)[:, : problem.dimension]
+    room = float(problem.team.wall_radius[0]) + problem.margin if clearance is None else clearance
     clearance = float(problem.team.radius[0]) + problem.margin if clearance is None else clearance
     distance = clearance + float(np.max(problem.team.radius))
     low, high = goal_region(problem)
     for _ in range(_ATTEMPTS):
         position = random.uniform(low, high).astype(np.float32)
-        if (
-            problem.world.clearance(position) > clearance
-            and (np.linalg.norm(others - position, axis=1) > distance).all()
-        ):
+        if problem.world.clearance(position) > room and (np.linalg.norm(others - position, axis=1) > distance).all():
             return position
     raise ValueError("there is no room for one more; remove something first")
 

@@ -178,6 +178,74 @@ def test_ellipsoids_among_obstacles() -> None:
             assert (report.min_clearance <= 0) == collides
 
 
+@pytest.mark.parametrize("gap", [0.01, -0.01])
+def test_obstacles_and_bounds_meet_the_body_of_an_ellipsoid(gap: float) -> None:
+    """Below a sphere, under the ceiling, over the floor and a box, and beside a cylinder."""
+    obstacles = {"spheres": [[0, 0, 1, 0.2]], "cylinders": [[3, 0, 0.2]], "boxes": [[5, -1, 0, 6, 1, 1]]}
+    world = World(3, **obstacles, lower=[-9, -9, 0], upper=[9, 9, 2])
+    body, team = 0.1, Team(("holonomic3d",), footprint=Ellipsoid(0.1, 0.1, 0.3, body=0.1))
+    problem = Problem(team, [[-3, 0, 1, 0, 0, 0]], [[-3, 0, 1.5]], world, horizon=1, margin=0.05)
+    away = body + gap
+    for position in ([0, 0, 0.8 - away], [-2, 0, 2 - away], [-2, 0, away], [5.5, 0, 1 + away], [2.8 - away, 0, 1]):
+        states = np.array([[*position, 0, 0, 0]], np.float32)
+        for engine in ENGINE_NAMES:
+            after = get_engine(engine).step(problem.arrays, states, np.zeros(1, bool), np.zeros((1, 3), np.float32))
+            assert bool(after.collided[0]) == (gap < 0), (position, engine)
+            assert after.margin_violated[0]
+        report = verify(problem.with_state(states, problem.goal), np.zeros((1, 1, 3), np.float32))
+        assert report.min_clearance == pytest.approx(gap, abs=1e-6)
+        pose = np.append(np.array(position), 0.0)
+        assert world_gap(world, team.footprint[0], pose) == pytest.approx(gap, abs=1e-3)
+    env = navigation_v0.parallel_env(problem=problem, observed_obstacles=1)
+    seen = env.reset(seed=0)[0]["robot_0"]
+    assert np.isclose(seen, 0.9).any()  # 1 m above the floor
+
+
+def test_ellipsoids_meet_other_robots_whatever_these_are() -> None:
+    """Over another ellipsoid with or without a body, and over a ball."""
+    for other, reach in ((Ellipsoid(0.1, 0.1, 0.3, 0.1), 0.3), (Ellipsoid(0.2, 0.1, 0.25), 0.25), (Disc(0.15), 0.15)):
+        for gap in (0.01, -0.01):
+            team = Team(("holonomic3d",) * 2, footprint=[Ellipsoid(0.1, 0.1, 0.3, 0.1), other])
+            states = np.array([[0] * 6, [0, 0, 0.3 + reach + gap, 0, 0, 0]], np.float32)
+            problem = Problem(team, [[0] * 6, [9, 0, 0, 0, 0, 0]], [[0, 9, 0], [9, 9, 0]], horizon=1)
+            for engine in ENGINE_NAMES:
+                still = np.zeros(2, bool), np.zeros((2, 3), np.float32)
+                after = get_engine(engine).step(problem.arrays, states, *still)
+                assert after.collided.tolist() == [gap < 0] * 2
+            report = verify(problem.with_state(states, problem.goal), np.zeros((1, 2, 3), np.float32))
+            assert report.min_separation == pytest.approx(gap, abs=1e-4)
+
+
+@given(st.tuples(*[st.floats(0.05, 0.5)] * 4), st.tuples(*[st.floats(-1.2, 1.2)] * 3), st.floats(0, 0.3))
+@settings(max_examples=60, deadline=None)
+def test_flattened_balls_are_near_where_ellipsoids_are(
+    sizes: tuple[float, ...], offset: tuple[float, ...], margin: float
+) -> None:
+    """Just there where all are alike, and where they are not, at least there."""
+    (a, b, c, e), away = sizes, np.array(offset)
+    for one, other in ((Ellipsoid(a, a, c), Ellipsoid(a, a, c)), (Ellipsoid(a, b, c), Ellipsoid(b, b, e)),
+                       (Ellipsoid(a, a, c), Disc(e))):  # fmt: skip
+        team = Team(("holonomic3d",) * 2, footprint=[one, other])
+        flat = float(np.linalg.norm(team.flattened(away, margin)) - team.girth.sum()) - margin
+        wider = [Ellipsoid(*(axis + margin / 2 for axis in shape.semi_axes)) for shape in (one, other)]
+        gap = pair_gap(wider[0], np.zeros(4), wider[1], np.append(away, 0.0))
+        assert flat <= 1e-3 or gap >= -1e-3
+        if one == other and a <= c:
+            assert (flat > 0) == (gap > 0) or abs(gap) < 1e-3
+
+
+def test_a_body_is_kept_in_files_and_checked(tmp_path: Path) -> None:
+    team = Team(("holonomic3d",) * 2, footprint=[Ellipsoid(0.1, 0.1, 0.3, body=0.08), Ellipsoid(0.1, 0.1, 0.3)])
+    problem = Problem(team, [[0] * 6, [2, 0, 0, 0, 0, 0]], [[0, 3, 0], [2, 3, 0]])
+    save_problem(problem, tmp_path / "team.yaml")
+    assert load_problem(tmp_path / "team.yaml") == problem
+    np.testing.assert_allclose(team.wall_radius, [0.08, 0.3])
+    np.testing.assert_allclose(team.inner_radius, [0.08, 0.1], rtol=1e-5)
+    assert repr(team.shapes[1]) == "Ellipsoid(x=0.1, y=0.1, z=0.3)"  # of which digests are made
+    with pytest.raises(ValueError, match=r"body of Ellipsoid is 0\.2; its ball must be within the ellipsoid, 0\.1 at"):
+        Ellipsoid(0.1, 0.1, 0.3, body=0.2)
+
+
 def test_discs_given_as_footprints_are_the_same_team() -> None:
     problem = make_problem("circle", num_robots=4)
     other = problem.replace(team=problem.team.replace(footprint=Disc(0.15)))

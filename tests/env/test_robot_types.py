@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from d4orm_env import Problem, Team, load_problem, make_problem, make_team, navigation_v0, save_problem
+from d4orm_env.core.problem_checks import check_physics
 from d4orm_env.core.robot_types import ROBOTS
 from d4orm_env.disturbances import Lag
-from d4orm_env.footprints import Ellipsoid
+from d4orm_env.footprints import Disc, Ellipsoid
 from d4orm_planners import Controller, make_planner
 
 
@@ -20,8 +21,11 @@ from d4orm_planners import Controller, make_planner
 def test_a_team_of_robots_by_name(name: str) -> None:
     team, robot = make_team(name, 3), ROBOTS[name]
     assert team.models == (robot.model,) * 3
-    for limit in ("radius", "max_speed", "max_acceleration", "max_turn_rate", "lag", "margin"):
+    for limit in ("max_speed", "max_acceleration", "max_turn_rate", "lag", "margin"):
         np.testing.assert_allclose(getattr(team, limit), getattr(robot, limit), rtol=1e-6)
+    for size in (team.inner_radius, team.wall_radius, team.girth):
+        np.testing.assert_allclose(size, robot.radius, rtol=1e-5)
+    np.testing.assert_allclose(team.radius, max(robot.radius, robot.downwash))
 
 
 @pytest.mark.parametrize(
@@ -51,7 +55,7 @@ def test_scenarios_take_robots_by_name(name: str) -> None:
     problem = make_problem("circle", robot=name, num_robots=4)
     assert set(problem.team.models) == {ROBOTS[name].model}
     assert problem.margin == ROBOTS[name].margin
-    np.testing.assert_allclose(problem.team.radius, ROBOTS[name].radius, rtol=1e-6)
+    np.testing.assert_allclose(problem.team.wall_radius, ROBOTS[name].radius, rtol=1e-6)
     np.testing.assert_allclose(problem.goal_speed, ROBOTS[name].max_acceleration * problem.dt, rtol=1e-6)
 
 
@@ -88,22 +92,40 @@ def test_controllers_in_an_environment_take_its_lag(disturbances: Any, lag: floa
     np.testing.assert_allclose(controller.lag, lag)
 
 
-def test_drones_leave_room_for_their_downwash_where_they_are_told_to() -> None:
-    team = make_team("crazyflie", 2, downwash=True)
-    assert team == make_problem("circle", 2, robot="crazyflie", downwash=True, height=1.0).team
+def test_drones_leave_room_for_their_downwash() -> None:
+    team = make_team("crazyflie", 2)
+    assert team == make_team("crazyflie", 2, downwash=True)
+    assert team == make_problem("circle", 2, robot="crazyflie", height=1.0).team
     drone = ROBOTS["crazyflie"]
-    assert team.footprint == (Ellipsoid(drone.radius, drone.radius, drone.downwash),) * 2
+    assert team.footprint == (Ellipsoid(drone.radius, drone.radius, drone.downwash, drone.radius),) * 2
     start, goal = np.zeros((2, 6)), np.zeros((2, 3))
     start[1, 2], goal[:, 0], goal[1, 2] = 0.49, 1.0, 0.49
     with pytest.raises(ValueError, match=r"robot_1 at .* overlap by"):
         Problem(team, start, goal)
-    Problem(make_team("crazyflie", 2), start, goal)
+    balls = make_team("crazyflie", 2, downwash=False)
+    assert not balls.shapes
+    Problem(balls, start, goal)
     with pytest.raises(ValueError, match="downwash is True, and this robot has none"):
         make_team("jackal", 2, downwash=True)
     with pytest.raises(ValueError, match="downwash is of robots by name; give robot"):
         make_problem("circle", 2, downwash=True)
     with pytest.raises(ValueError, match="downwash is 1; it must be True or False"):
         make_problem("circle", 2, robot="crazyflie", downwash=1)
+
+
+def test_another_radius_is_that_of_the_body() -> None:
+    team = make_problem("circle", 2, robot="crazyflie", radius=[0.1, 0.3], height=1.0).team
+    assert team.footprint == (Ellipsoid(0.1, 0.1, 0.25, 0.1), Ellipsoid(0.3, 0.3, 0.3, 0.3))
+    assert (
+        make_problem("circle", 2, robot="crazyflie", footprint=Disc(0.2), height=1.0).team.radius.tolist()
+        == [np.float32(0.2)] * 2
+    )
+
+
+@pytest.mark.parametrize("name", ["circle", "sphere", "random", "four_obstacles", "swap", "forest"])
+def test_spatial_scenarios_have_room_for_twenty_drones(name: str) -> None:
+    problem = make_problem(name, 20, robot="crazyflie", height=None if name == "sphere" else 1.0)
+    assert not check_physics(problem)
 
 
 def test_lags_that_make_no_sense_are_named() -> None:

@@ -97,7 +97,7 @@ def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> Path
     reference = np.empty((POINTS + 1, 3))
     length = max(resample(path, reference), problem.goal_radius)
     limits = problem.team.limits[robot].astype(np.float64)
-    safety_distance = float(problem.team.radius[robot]) + problem.margin
+    safety_distance = float(problem.team.wall_radius[robot]) + problem.margin
     speed = float(limits[SPEED])
     acceleration = float(limits[ACCELERATION]) if problem.team.robot_models[robot].speed_indices else _ANY * speed
     tangents = np.empty_like(reference)
