@@ -46,11 +46,12 @@ class RobotType:
         """Arguments of scenarios for a team of these: as balls, or with room for their downwash by default if they have
         one; and of another ``radius``, if given.
         """
-        if downwash is not None and truth(downwash, "downwash") and not self.downwash:
+        wide = bool(self.downwash) if downwash is None else truth(downwash, "downwash")
+        if wide and not self.downwash:
             raise ValueError("downwash is True, and this robot has none; leave it out, or choose a drone as robot")
         names = ("model", "max_speed", "max_acceleration", "max_turn_rate", "margin", "lag")
         settings, radius = {name: getattr(self, name) for name in names}, self.radius if radius is None else radius
-        if not self.downwash or downwash is False:
+        if not wide:
             return settings | {"radius": radius}
         shapes = [Ellipsoid(size, size, self._reach(size), size) for size in (radius if np.ndim(radius) else [radius])]
         return settings | {"footprint": shapes if np.ndim(radius) else shapes[0]}
