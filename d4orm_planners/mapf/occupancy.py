@@ -47,7 +47,7 @@ class Occupancy:
         flatten: What is done to positions before distances are measured; see :meth:`Team.flattened`.
     """
 
-    def __init__(self, cells: Cells, positions: Floats, flatten: Callable[[Floats], Floats]) -> None:
+    def __init__(self, cells: Cells, positions: Floats, flatten: Callable[[Floats], Floats] = np.asarray) -> None:
         rows, num_robots, _ = positions.shape
         self._cells, self.positions, self._flatten = cells, positions, flatten
         # Searches look at a robot at many steps in turn.
