@@ -75,7 +75,7 @@ ROBOTS: Mapping[str, RobotType] = MappingProxyType({
         max_acceleration=(2.0, "ours: a tilt of 11 degrees, which leaves thrust for the height with a low battery"),
         margin=(0.1, _FLOWN + "largest tracking error 0.06 m, 0.11 m with gusts"),
         lag=(0.2, _FLOWN + "of accelerations; 0.1 s left D4orm-C2F circling its goals"),
-        downwash=(0.25, "ours: with the margin as the ellipsoid of 0.12 x 0.12 x 0.3 m usual for it; flown without simulated downwash"),
+        downwash=(0.25, "ours: with the margin as the ellipsoid of 0.12 x 0.12 x 0.3 m usual for it"),
     ),
     "crazyflie_brushless": _robot(
         "holonomic3d",
