@@ -82,7 +82,7 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
 
 def _judge(problem: Problem, array: Floats) -> VerificationReport:
     motion = TeamMotion(problem, array)
-    sub_steps = np.ceil(problem.dt * np.sqrt(motion.bend / (8 * CHORD_ERROR * problem.team.radius.astype(np.float64))))
+    sub_steps = np.ceil(problem.dt * np.sqrt(motion.bend / (8 * CHORD_ERROR * problem.team.girth.astype(np.float64))))
     if sub_steps.max() > MAX_SUB_STEPS:
         return _left_out(problem, list(_too_violent(sub_steps, motion, problem)))
     course = _Course(motion, max(MIN_SUB_STEPS, int(sub_steps.max())), problem)
@@ -247,7 +247,7 @@ def _non_finite(controls: Floats, dt: float) -> list[Violation]:
 def _too_violent(sub_steps: Floats, motion: TeamMotion, problem: Problem) -> Iterator[Violation]:
     for robot in np.flatnonzero((sub_steps > MAX_SUB_STEPS).any(axis=0)):
         step = int(np.argmax(sub_steps[:, robot] > MAX_SUB_STEPS))
-        error = CHORD_ERROR * float(problem.team.radius[robot])
+        error = CHORD_ERROR * float(problem.team.girth[robot])
         detail = (
             f"accelerates with {motion.bend[step, robot]:.4g} m/s^2 at step {step}, which {MAX_SUB_STEPS} sub-steps of "
             f"a step of {problem.dt:g} s do not follow to {error:.2g} m; use a smaller dt, or lower limits"

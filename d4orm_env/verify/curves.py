@@ -47,7 +47,7 @@ def verify_curves(
     team, radius = problem.team, problem.team.radius.astype(np.float64)
     steps = max(1, int(np.ceil(duration / problem.dt)))
     dt = duration / steps
-    sub_steps = max(1, int(np.ceil(dt * np.sqrt(bend / (8 * CHORD_ERROR * radius))).max()))
+    sub_steps = max(1, int(np.ceil(dt * np.sqrt(bend / (8 * CHORD_ERROR * team.girth.astype(np.float64)))).max()))
     trailers, shapes = _Trailers.of(problem), ConvexBodies.of(team) if team.shapes else None
     robots = np.concatenate([np.arange(len(radius)), trailers.robot])
     pairs, obstacles = make_watches(problem.world, robots, radius, shapes)

@@ -45,7 +45,7 @@ def on_short_paths(task: SamplingTask, search: SolveRun) -> SamplingTask:
     Where goals are not absorbing all steps count, and it is the task itself too.
     """
     problem = task.problem
-    reference = SHORT * (2 * float(np.max(problem.team.radius)) + problem.margin)
+    reference = SHORT * (2 * float(np.max(problem.team.girth)) + problem.margin)
     lengths = np.linalg.norm(problem.goal - problem.start[:, : problem.dimension], axis=1).astype(np.float64)
     if problem.num_robots == 1 or not problem.docks or lengths.max() >= reference:
         return task

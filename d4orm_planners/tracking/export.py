@@ -130,7 +130,7 @@ def fit_polynomials(motion: SmoothMotion, height: float) -> Polynomials:
     """
     for count in range(1, MOST_PIECES + 1):
         curves, deviation = _pieces(motion, count)
-        if deviation <= CLOSE * float(motion.problem.team.radius.min()):
+        if deviation <= CLOSE * float(motion.problem.team.girth.min()):
             break
     spline = _as_spline(curves)
     ways, turns = (BSpline(spline.t, part, spline.k) for part in (spline.c[..., :-1], spline.c[..., -1]))

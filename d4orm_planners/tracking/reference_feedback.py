@@ -160,7 +160,7 @@ def _unless_lost(problem: Problem, states: FloatArray, reference: Reference, con
     or have stopped far beside a reference that stands: those drive to where it will be, and stand where that is near.
     """
     goals = reference.after[:, : problem.dimension]
-    far = np.linalg.norm(goals - states[:, : problem.dimension], axis=1) > NEAR * problem.team.radius
+    far = np.linalg.norm(goals - states[:, : problem.dimension], axis=1) > NEAR * problem.team.girth
     turns = np.array([model.heading_index is not None for model in problem.team.robot_models])
     facing = np.abs(problem.team.headings(short_way_round(problem, reference.states - states)))
     stands = (reference.after == reference.states).all(axis=1)
@@ -215,7 +215,7 @@ def _augmented(by_state: Floats, by_control: Floats, missed: Floats, lag: Actuat
 def _weights(team: Team) -> Floats:
     """``(K, n)`` of squared distances from the reference."""
     weights, headings = np.zeros((team.num_robots, team.state_size)), [m.heading_index for m in team.robot_models]
-    weights[:, : team.dimension] = 1 / team.radius[:, None].astype(np.float64) ** 2
+    weights[:, : team.dimension] = 1 / team.girth[:, None].astype(np.float64) ** 2
     for robot, heading in enumerate(headings):
         if heading is not None:
             weights[robot, heading] = 1.0

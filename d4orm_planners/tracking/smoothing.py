@@ -191,7 +191,7 @@ def least_overhead(problem: Problem, positions: Floats) -> float:
     """Least height of a robot above another, of positions ``(T, K, d)``, where both overlap seen from above [m];
     infinite where none do, or the team moves in the plane. Who passes beside another is not above it.
     """
-    least, radius = np.inf, problem.team.radius.astype(np.float64)
+    least, radius = np.inf, problem.team.girth.astype(np.float64)
     if problem.dimension == 2:
         return least
     for robot in range(1, problem.num_robots):
