@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from d4orm_planners.base.controller import Controller
     from d4orm_planners.base.episode import Episode, run_episode
-    from d4orm_planners.base.mixed_policy import MixedPolicy
     from d4orm_planners.base.names import register_planner, register_policy
     from d4orm_planners.base.plan import IterationRecord, Plan, load_plan
     from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
     from d4orm_planners.base.planner_registry import list_planners, list_policies, make_planner, make_policy
     from d4orm_planners.base.policy import OpenLoop, Policy
+    from d4orm_planners.base.shared_policy import MixedPolicy
     from d4orm_planners.base.solve import SolveRun
     from d4orm_planners.evaluation.evaluate import evaluate
 
@@ -27,7 +27,7 @@ _HOMES = {
     "base.controller": ("Controller",),
     "base.episode": ("Episode", "run_episode"),
     "evaluation.evaluate": ("evaluate",),
-    "base.mixed_policy": ("MixedPolicy",),
+    "base.shared_policy": ("MixedPolicy",),
     "base.names": ("register_planner", "register_policy"),
     "base.plan": ("IterationRecord", "Plan", "load_plan"),
     "base.planner": ("Iteration", "Planner", "PlannerConfig"),

@@ -20,9 +20,7 @@ tensordict_nn: Any = LazyModule("tensordict.nn")
 torch: Any = LazyModule("torch")
 
 __all__ = ["SharedPolicy", "from_rllib", "from_sb3", "from_torch", "from_torchrl"]
-
-Key: TypeAlias = str | tuple[str, ...]
-"""A key of a ``TensorDict``."""
+Key: TypeAlias = str | tuple[str, ...]  #: A key of a ``TensorDict``
 
 
 @dataclass(frozen=True)

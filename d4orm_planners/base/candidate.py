@@ -21,12 +21,8 @@ if TYPE_CHECKING:
 else:
     path_index = LazyModule("d4orm_planners.engine.path_index")
 
-Graph: TypeAlias = tuple[frozenset[int], ...]
-"""The robots that each robot is in conflict with."""
-
-Groups: TypeAlias = tuple[tuple[int, ...], ...]
-"""Robots by the group that they are in."""
-
+Graph: TypeAlias = tuple[frozenset[int], ...]  #: The robots that each robot is in conflict with
+Groups: TypeAlias = tuple[tuple[int, ...], ...]  #: Robots by the group that they are in
 MOST_OF_LIMIT = LARGEST_NUMBER / LARGEST
 """Largest multiple of its limit that a planned control may be, so that its square does not overflow."""
 
@@ -40,8 +36,7 @@ class Candidate:
     controls: FloatArray  #: ``(H, K, m)`` as executed: inside the limits, zero after arrival
     trajectory: Trajectory  #: Their rollout
     failed: BoolArray  #: ``(K,)`` robots that do not arrive, or violate the margin at some step that was checked
-    #: Report of :func:`d4orm_env.verify`; ``None`` where a robot fails at any step, or it was not asked
-    report: VerificationReport | None
+    report: VerificationReport | None  #: :func:`d4orm_env.verify`'s; ``None`` where a robot fails, or it was not asked
     solved: bool  #: Whether all arrive, the margin is kept at every step, and the report, if there is one, agrees
 
     @property

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pettingzoo import ParallelEnv
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, check_choice, positive_number, read_only, truth
 from d4orm_env.core.problem import Problem
@@ -28,17 +29,10 @@ from d4orm_planners.tracking.reference_feedback import (
 )
 from d4orm_planners.tracking.steering import advanced, limited_states, present_velocities, track_velocities, weaker
 
-if TYPE_CHECKING:
-    from pettingzoo import ParallelEnv
-
 Mode = Literal["nominal", "measured"]
-
-SAME_PERIOD = 0.5
-"""Share of a period within which another call gets the same setpoint."""
-LATE = 0.25
-"""Share of a period by which a late step's successors may come earlier than a period after it."""
-IN_TIME = 0.9
-"""Share of a step's timeout that is a policy's deadline."""
+SAME_PERIOD = 0.5  #: Share of a period within which another call gets the same setpoint
+LATE = 0.25  #: Share of a period by which a late step's successors may come earlier than a period after it
+IN_TIME = 0.9  #: Share of a step's timeout that is a policy's deadline
 
 
 class Controller:

@@ -23,8 +23,7 @@ else:
     replay = LazyModule("d4orm_env.render.replay")
 
 
-_MARKDOWN = "\\`*{}[]<>|~&"
-"""Characters that begin markup within a line, that of MDX included, which has code in braces."""
+_MARKDOWN = "\\`*{}[]<>|~&"  #: Characters that begin markup within a line, also that of MDX, which has code in braces
 _FORMULA = "=+-@"
 
 

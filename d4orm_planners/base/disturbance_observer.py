@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import ArrayLike
+from pettingzoo import ParallelEnv
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, short_repr
 from d4orm_env.core.problem import Problem
@@ -13,15 +12,9 @@ from d4orm_env.disturbances.controls import Lag
 from d4orm_planners.tracking.reference_feedback import ActuatorLag
 from d4orm_planners.tracking.steering import limit_controls, rates, short_way_round
 
-if TYPE_CHECKING:
-    from pettingzoo import ParallelEnv
-
-GAIN = 0.1
-"""Share of a step's residual that goes into the estimate."""
-MOST = 0.5
-"""Largest estimate, as a share of the control's limit: the rest is needed to steer."""
-LAGS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
-"""Time constants that are told apart where none is given, in time steps."""
+GAIN = 0.1  #: Share of a step's residual that goes into the estimate
+MOST = 0.5  #: Largest estimate, as a share of the control's limit: the rest is needed to steer
+LAGS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)  #: Time constants that are told apart where none is given, in time steps
 KEPT, STEPS, BETTER, DRIVEN = 0.95, 15, 0.6, 0.2
 """Share of what is known of them that a step keeps, steps after which they are compared, the share of its residual with
 which another one than the present must explain what robots did, and the deviation that their controls must have had, as
@@ -170,14 +163,8 @@ class LagFinder:
     """Estimator of the lag of each robot's actuators: of a few time constants (:data:`LAGS`) the one from which what
     robots did follows best by a straight line, so that neither a steady push nor weak actuators make a difference.
 
-    Robots whose controls do not sum up to a state are taken to have none.
-
-    Args:
-        problem: The team.
-        summed: ``(K, n, m)`` which states are sums of which controls, see :func:`_summed_controls`.
-
-    Attributes:
-        constants: ``(K,)`` time constants found so far [s].
+    Robots whose controls do not sum up to a state are taken to have none; ``summed`` ``(K, n, m)`` is
+    :func:`_summed_controls`.
     """
 
     def __init__(self, problem: Problem, summed: FloatArray) -> None:
@@ -187,7 +174,7 @@ class LagFinder:
         self._means = self._applied.copy()
         self._moments = np.zeros((6, *self._applied.shape))
         self._before: FloatArray | None = None
-        self.constants = np.zeros(count)
+        self.constants = np.zeros(count)  #: ``(K,)`` time constants found so far [s]
 
     @property
     def applied(self) -> Floats:

@@ -1,8 +1,9 @@
-"""Running a policy through an environment."""
+"""Running a policy through an environment, in the physics of a name."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import gymnasium
@@ -12,6 +13,8 @@ from pettingzoo import ParallelEnv
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray, short_repr, whole_number
+from d4orm_env.core.errors import no_setting
+from d4orm_env.core.files import parse_yaml
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import count
 from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory, accelerations, mean_squared_jerk
@@ -20,9 +23,46 @@ from d4orm_env.envs.joint_env import JointNavigationEnv
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.envs.team_step import AgentInfos
 from d4orm_planners.base.display import DisplayMixin
-from d4orm_planners.base.physics import find_physics
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy
 from d4orm_planners.base.policy import Policy, robot_indices
+
+PHYSICS = {"model": "", "mujoco": "Physics", "crazyflow": "DronePhysics"}
+"""The equations that planners know, rigid bodies in MuJoCo, or drones in crazyflow; and the class of settings."""
+
+
+def find_physics(physics: str, problem: Problem | None = None) -> tuple[Any, dict[str, Any]]:
+    """The module with the environment of a physics, and further arguments for this environment.
+
+    Args:
+        physics: One of :data:`PHYSICS`; behind a colon settings of :class:`d4orm_env.mujoco.Physics` or
+            :class:`d4orm_env.crazyflow.DronePhysics`, as ``"crazyflow:gust=0.02,mass_factor=1.05"``.
+        problem: A problem whose robots it is to move.
+
+    Raises:
+        ValueError: For an unknown physics or setting, a setting out of range, or robots that have no bodies in it.
+        ImportError: If it needs a library that is not installed.
+    """
+    name, colon, listed = physics.partition(":") if isinstance(physics, str) else ("", "", "")
+    if name not in PHYSICS:
+        raise ValueError(f"physics is {short_repr(physics)}; choose one of {', '.join(PHYSICS)}")
+    if name == "model":
+        if colon:
+            raise ValueError(f"physics is {short_repr(physics)}, and the model has no settings; give disturbances")
+        return navigation_v0, {}
+    module = import_module(f"d4orm_env.{name}")
+    if problem is not None:
+        module.check_problem(problem)
+    if not colon:
+        return module, {}
+    kind, settings = getattr(module, PHYSICS[name]), {}
+    for part in listed.split(","):
+        setting, equals, text = part.partition("=")
+        if not equals or setting in settings:
+            raise ValueError(f"physics is {short_repr(physics)}; give settings once each, as {name}:name=value,...")
+        if setting not in kind.__dataclass_fields__:
+            raise no_setting(setting, f"physics {name!r}", kind.__dataclass_fields__)
+        settings[setting] = parse_yaml(text)
+    return module, {"physics": kind(**settings)}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -73,7 +113,7 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
             with no wrappers but those of ``gymnasium.make``: the parallel one of the same options runs in its place.
         policy: A policy, or anything else that :func:`~d4orm_planners.make_policy` takes.
         seed: Seeds both.
-        physics: See :func:`~d4orm_planners.base.physics.find_physics`; in place of ``env`` one like it runs.
+        physics: See :func:`~d4orm_planners.base.episode.find_physics`; in place of ``env`` one like it runs.
 
     Returns:
         The executed trajectory and its metrics.
@@ -151,7 +191,6 @@ def _outcome(env: ParallelEnv, rewards: dict[str, float]) -> tuple[FloatArray, B
 def _trajectory(
     problem: Problem, joints: list[JointState], outcomes: list[tuple[FloatArray, BoolArray, BoolArray]]
 ) -> Trajectory:
-    """Join the reset and all steps to one trajectory."""
     states = np.stack([joint.states for joint in joints])
     rewards, collided, margin_violated = map(np.stack, zip(*outcomes))
     return Trajectory(

@@ -24,15 +24,10 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.winding import MAX_ANGLE
 from d4orm_planners.tracking.steering import advanced, by_model, short_way_round
 
-OLDEST = 10
-"""Age of a measured state at most, in periods."""
-BEYOND = 4
-"""Distance beyond the state space at which measured numbers are cut off, in sizes of the space."""
-LATEST = 1e12
-"""Largest time [s]; one in nanoseconds since 1970 is larger."""
-
-Bounds = tuple[FloatArray, ...]
-"""Lowest and highest states ``(K, n)``."""
+OLDEST = 10  #: Age of a measured state at most, in periods
+BEYOND = 4  #: Distance beyond the state space at which measured numbers are cut off, in sizes of the space
+LATEST = 1e12  #: Largest time [s]; one in nanoseconds since 1970 is larger
+Bounds = tuple[FloatArray, ...]  #: Lowest and highest states ``(K, n)``
 
 
 def seconds(time: object) -> float:
@@ -68,9 +63,7 @@ def robots_by_agent(num_robots: int) -> dict[str, int]:
 
 
 def acting_robots(policy: object, observations: Mapping[str, object]) -> list[int]:
-    """Numbers of the robots that a policy is asked for; ValueError if observations are not by agent, RuntimeError
-    before reset.
-    """
+    """Numbers of the robots asked for; ValueError if observations are not by agent, RuntimeError before reset."""
     problem: Problem | None = getattr(policy, "problem", None)
     if problem is None:
         raise RuntimeError("the policy has seen no environment yet; call reset(env) before act()")

@@ -10,7 +10,6 @@ from d4orm_planners.base.planner import Planner
 
 
 def is_planner_class(thing: object) -> TypeGuard[type[Planner]]:
-    """Check whether a thing is a subclass of Planner."""
     return isinstance(thing, type) and issubclass(thing, Planner)
 
 
@@ -26,9 +25,7 @@ def _admit_policy(name: str, thing: object) -> object:
     return thing
 
 
-PLANNERS = Registry("planner", "d4orm.planners", _admit_planner)
-"""Every planner class by its name."""
-
+PLANNERS = Registry("planner", "d4orm.planners", _admit_planner)  #: Every planner class by its name
 POLICIES = Registry("policy", "d4orm.policies", _admit_policy)
 """The policies that are no planners; every planner is an open-loop policy too."""
 

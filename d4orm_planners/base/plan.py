@@ -67,48 +67,35 @@ class IterationRecord:
 class Plan(DisplayMixin):
     """Controls for a whole team, how they were found and what they lead to.
 
-    Attributes:
-        planner: Name of the planner.
-        problem: The problem.
-        seed: The seed.
-        controls: ``(H, K, m)`` inside the limits, zero after arrival. Not what speeds change by where the model limits
-            these: robots get :meth:`sample`.
-        solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` found no fault.
-        status: End of the search. ``"solved"``: with a solution. ``"iteration_limit"`` or ``"time_limit"``: with the
-            budget, so without a solution unless it was to be improved. ``"stopped"`` (by the callback) or
-            ``"interrupted"``: with whatever it had. ``"infeasible"``: at once, for there is a proof that nothing solves
-            the problem, see :func:`d4orm_env.core.infeasibility.prove_infeasible`. ``"refuted"``: a file says
-            ``"solved"`` or ``"infeasible"``, and that is not so.
-        iterations: Iterations done.
-        denoising_steps: Sample-score-update steps done.
-        wall_time: Seconds, first-call compilation excluded.
-        history: One record per iteration.
-        trajectory: Rollout of the controls.
-        metrics: See :func:`d4orm_env.core.trajectory.trajectory_metrics`, which looks for contact at steps, where
-            ``solved`` and ``failures`` know of contact between them too; and ``"denoising_steps"`` and
-            ``"denoising_share"``, the share of the iterations that did some. ``d-d4orm`` adds ``"messages"`` and
-            ``"message_bytes"`` that its nodes sent, each to all others, and ``"waiting_share"``, the share of their
-            time that they waited for each other.
-        provenance: Preset, settings, version and machine; ``None`` for a plan of an older file.
-
     Raises:
         ValueError: If the status is none of these, or ``"solved"`` and the plan is not, or ``"refuted"`` or
             ``"infeasible"`` and it is.
     """
 
-    planner: str
-    problem: Problem
-    seed: int
+    planner: str  #: Name of the planner
+    problem: Problem  #: The problem
+    seed: int  #: The seed
+    #: ``(H, K, m)`` inside the limits, zero after arrival. Not what speeds change by where the model limits these:
+    #: robots get :meth:`sample`
     controls: FloatArray
-    solved: bool
+    solved: bool  #: Everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` found no fault
+    #: End of the search. ``"solved"``: with a solution. ``"iteration_limit"`` or ``"time_limit"``: with the budget, so
+    #: without a solution unless it was to be improved. ``"stopped"`` (by the callback) or ``"interrupted"``: with
+    #: whatever it had. ``"infeasible"``: at once, for there is a proof that nothing solves the problem, see
+    #: :func:`d4orm_env.core.infeasibility.prove_infeasible`. ``"refuted"``: a file says ``"solved"`` or
+    #: ``"infeasible"``, and that is not so
     status: Status
-    iterations: int
-    denoising_steps: int
-    wall_time: float
-    history: tuple[IterationRecord, ...]
-    trajectory: Trajectory
+    iterations: int  #: Iterations done
+    denoising_steps: int  #: Sample-score-update steps done
+    wall_time: float  #: Seconds, first-call compilation excluded
+    history: tuple[IterationRecord, ...]  #: One record per iteration
+    trajectory: Trajectory  #: Rollout of the controls
+    #: See :func:`d4orm_env.core.trajectory.trajectory_metrics`, which looks for contact at steps, where ``solved`` and
+    #: ``failures`` know of contact between them too; and ``"denoising_steps"`` and ``"denoising_share"``, the share of
+    #: the iterations that did some. ``d-d4orm`` adds ``"messages"`` and ``"message_bytes"`` that its nodes sent, each
+    #: to all others, and ``"waiting_share"``, the share of their time that they waited for each other
     metrics: dict[str, float]
-    provenance: Provenance | None = None
+    provenance: Provenance | None = None  #: Preset, settings, version and machine; ``None`` for a plan of an older file
 
     def __post_init__(self) -> None:
         if self.status not in get_args(Status):

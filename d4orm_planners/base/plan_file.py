@@ -26,10 +26,7 @@ from d4orm_planners.base.plan import IterationRecord, Plan
 from d4orm_planners.base.provenance import Provenance
 
 FORMAT = "d4orm-plan-1"
-
-HEADER_BYTES = 64 * 2**20
-"""Largest header of a plan file, which has the problem and the history."""
-
+HEADER_BYTES = 64 * 2**20  #: Largest header of a plan file, which has the problem and the history
 TOLERANCE = 1e-3
 """Deviation allowed between a file's trajectory and its controls' rollout, in SI units for robots of the default size:
 processors round differently."""

@@ -20,9 +20,7 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import StepWatcher
 
 Callback = Callable[[IterationRecord], object]
-
-State: TypeAlias = Any
-"""A planner's state from one iteration to the next: a type of its own."""
+State: TypeAlias = Any  #: A planner's state from one iteration to the next: a type of its own
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,26 +53,20 @@ class Planner(ABC):
 
     What a planner keeps from one iteration to the next is its *state*, of whatever type it likes: :meth:`init` makes
     the first one and every :meth:`iterate` the next. A planner that keeps nothing has ``None``, and no ``init``.
-
-    Attributes:
-        name: Planner's name in its plans; that of the class unless it gives another.
-        config: The settings.
-        preset: Preset that it was made with, if any.
-        drives_straight: Whether it begins with straight drives, whose kernels the command line then compiles ahead.
-        presets: By name, settings for :func:`~d4orm_planners.make_planner`, which leaves out those that do not apply.
     """
 
-    name: ClassVar[str]
+    name: ClassVar[str]  #: Planner's name in its plans; that of the class unless it gives another
     config_class: ClassVar[type[PlannerConfig]] = PlannerConfig
-    drives_straight: ClassVar[bool] = False
+    drives_straight: ClassVar[bool] = False  #: It begins with straight drives: the command line compiles these ahead
+    #: By name, settings for :func:`~d4orm_planners.make_planner`, which leaves out those that do not apply
     presets: ClassVar[Mapping[str, Mapping[str, object]]] = {}
-    preset: str | None = None
+    preset: str | None = None  #: Preset that it was made with, if any
 
     def __init_subclass__(cls) -> None:
         cls.name = cls.__dict__.get("name", cls.__name__)
 
     def __init__(self, config: PlannerConfig) -> None:
-        self.config = config
+        self.config = config  #: The settings
 
     def init(self, search: SolveRun) -> State:
         """The state that the first iteration begins with."""

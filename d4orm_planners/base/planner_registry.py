@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias, TypeVar
 
 from d4orm_env.core.arrays import duration, short_repr
-from d4orm_env.core.errors import UnknownKeywordError, did_you_mean, no_setting, unknown
+from d4orm_env.core.errors import UnknownKeywordError, describe, did_you_mean, no_setting, unknown
 from d4orm_env.core.registry import check_call, load_reference, source_digest, source_object
 from d4orm_planners.base.names import PLANNERS, POLICIES, is_planner_class
 from d4orm_planners.base.planner import Planner
@@ -15,15 +16,9 @@ from d4orm_planners.base.policy import OpenLoop, Policy, acts, as_policy, makes_
 from d4orm_planners.base.provenance import attributes
 from d4orm_planners.base.settings import NOTHING, CheckedSettings
 
-_NO_TEXT = ("bool", "float", "int")
-"""Annotations of keywords for which text, as a command line has it, is refused."""
-
-RECOMMENDED = "hybrid"
-"""The planner that solves most problems, and soonest."""
-
-Presets: TypeAlias = Mapping[str, Mapping[str, object]]
-"""Settings by preset."""
-
+_NO_TEXT = ("bool", "float", "int")  #: Annotations of keywords for which text, as a command line has it, is refused
+RECOMMENDED = "hybrid"  #: The planner that solves most problems, and soonest
+Presets: TypeAlias = Mapping[str, Mapping[str, object]]  #: Settings by preset
 Config = TypeVar("Config", bound=CheckedSettings)
 
 PolicyLike: TypeAlias = str | Policy | Planner | type[object] | Callable[..., object]
@@ -102,9 +97,7 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
 
 
 def find_policy(policy: object) -> object:
-    """Return the thing that a policy's name or import path stands for, else a ValueError; all but text is returned as
-    it is.
-    """
+    """The thing that a name or import path stands for, else a ValueError; all but text is returned as it is."""
     if is_brought(policy):
         return policy
     if isinstance(policy, str):
@@ -199,13 +192,11 @@ def policy_settings(name: object, **config: Any) -> dict[str, object]:
 
 
 def _presets(kind: object) -> Presets:
-    """Return the presets of a planner's or policy's class; none where it has none."""
     presets: Presets = getattr(kind, "presets", {})
     return presets
 
 
 def _policy_config(kind: object, config_class: type[Config], given: Mapping[str, object], owner: str) -> Config:
-    """A policy's settings, with those of a preset where the policy has presets."""
     config, presets = dict(given), _presets(kind)
     preset = config.pop("preset", None) if presets else None
     return _configured(config_class, presets, preset, config, owner)
@@ -214,9 +205,7 @@ def _policy_config(kind: object, config_class: type[Config], given: Mapping[str,
 def _configured(
     config_class: type[Config], presets: Presets, preset: object, config: Mapping[str, object], owner: str
 ) -> Config:
-    """Settings as given, on top of those of a preset; ValueError or, for an unknown setting, TypeError for what makes
-    no sense.
-    """
+    """The settings on top of those of a preset; ValueError or, for an unknown one, TypeError."""
     if preset is not None and not (isinstance(preset, str) and preset in presets):
         remedy = f"choose one of {', '.join(presets)}" if presets else "it has none, so leave it out"
         raise ValueError(f"preset {short_repr(preset)} of {owner} is unknown; {remedy}{did_you_mean(preset, presets)}")
@@ -278,3 +267,24 @@ def _time_limit(config: dict[str, object]) -> float | None:
 def called(thing: object) -> str:
     """Return the name of a policy for messages."""
     return thing if isinstance(thing, str) else getattr(thing, "__name__", type(thing).__name__)
+
+
+def fresh_policy(name: PolicyLike, **config: Any) -> Policy:
+    """:func:`make_policy`, where that returns a given instance, a copy of it: its episodes do not change it."""
+    policy = make_policy(name, **config)
+    return copy_policy(policy) if policy is find_policy(name) else policy
+
+
+def copy_policy(policy: Policy) -> Policy:
+    """A policy like this one, whose episodes do not change it. Raises ValueError if it cannot be copied."""
+    # Those of this package begin anew at every reset.
+    if type(policy).__module__.startswith("d4orm_planners."):
+        return copy.copy(policy)
+    try:
+        return copy.deepcopy(policy)
+    except Exception as error:  # objects reduce themselves by methods of their own
+        policy.identity()  # what cannot be told from others is to be told first
+        raise ValueError(
+            f"policy {called(policy)!r} cannot be copied for an episode of its own ({describe(error)}); give its "
+            "class, or a function that makes it, in place of the instance"
+        ) from error

@@ -36,17 +36,14 @@ class Policy(ABC):
 
     A subclass has :meth:`act`, and a :meth:`reset` if it draws, plans or remembers anything. One object drives one
     episode at a time: calls from several threads that would mix theirs are a RuntimeError.
-
-    Attributes:
-        problem: Problem of the present episode, from the reset on.
-        config_class: :class:`~d4orm_planners.base.settings.CheckedSettings` of the policy, of which the constructor
-            then takes an instance. Without one, settings are keyword arguments of the constructor.
-        presets: By name, settings of ``config_class`` for :func:`~d4orm_planners.make_policy`.
     """
 
+    #: :class:`~d4orm_planners.base.settings.CheckedSettings` of the policy, of which the constructor then takes an
+    #: instance. Without one, settings are keyword arguments of the constructor
     config_class: ClassVar[type[CheckedSettings] | None] = None
+    #: By name, settings of ``config_class`` for :func:`~d4orm_planners.make_policy`
     presets: ClassVar[Mapping[str, Mapping[str, object]]] = {}
-    problem: Problem
+    problem: Problem  #: Problem of the present episode, from the reset on
 
     def __init_subclass__(cls, **keywords: object) -> None:
         super().__init_subclass__(**keywords)

@@ -15,9 +15,7 @@ from typing import Any, Generic, TypeVar
 from d4orm_env.engine.threads import keep_to_one_core
 
 Result = TypeVar("Result")
-
-ATTRIBUTE = "_driving"
-"""Attribute of a policy's :class:`Driving`, which its copies do not share."""
+ATTRIBUTE = "_driving"  #: Attribute of a policy's :class:`Driving`, which its copies do not share
 _REMEDY = "make a policy for every thread, with make_policy() or copy.copy()"
 
 
@@ -104,7 +102,6 @@ class Background(Generic[Result]):
         return type(self), (self._initializer is not None,)
 
     def start(self, work: Callable[[], Result]) -> Future[Result]:
-        """Begin a job."""
         if self._pool is None:
             self._pool = ThreadPoolExecutor(1, thread_name_prefix="background", initializer=self._initializer)
         self._job = self._pool.submit(work)
@@ -112,7 +109,6 @@ class Background(Generic[Result]):
 
     @property
     def is_busy(self) -> bool:
-        """True if a job is under way."""
         return self._job is not None and not self._job.done()
 
     def result(self) -> tuple[bool, Result | None]:

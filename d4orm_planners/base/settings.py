@@ -64,12 +64,10 @@ def one_of(choices: Iterable[str]) -> AfterValidator:
 Whole = Annotated[int, BeforeValidator(_whole), Field(le=LARGEST_WHOLE)]
 Count = Annotated[Whole, Field(ge=1)]
 Samples = Annotated[Whole, Field(ge=2, le=10**7)]
-Steps = Annotated[Whole, Field(ge=1, le=10**6)]
-"""A number of samples or steps, no more than memory and time allow."""
+Steps = Annotated[Whole, Field(ge=1, le=10**6)]  #: A number of samples or steps, no more than memory and time allow
 Number = Annotated[float, BeforeValidator(_number), Field(le=LARGEST_NUMBER)]
 Positive = Annotated[Number, Field(gt=0)]
-Seconds = Annotated[Number, Field(ge=0, le=LARGEST)]
-"""No clock waits longer."""
+Seconds = Annotated[Number, Field(ge=0, le=LARGEST)]  #: No clock waits longer
 NotNegative = Annotated[Number, Field(ge=0)]
 Share = Annotated[Number, Field(gt=0, le=1)]
 ShareOrNone = Annotated[Number, Field(ge=0, le=1)]
@@ -106,12 +104,7 @@ class CheckedSettings:
 
     @classmethod
     def from_keywords(cls, given: Mapping[str, object], owner: str) -> Self:
-        """Settings as users give them.
-
-        Raises:
-            UnknownKeywordError: If one of them is no setting; one line that names it, whose it is not, and those that
-                there are.
-        """
+        """Settings as users give them; an UnknownKeywordError names what is none, whose, and those there are."""
         known = cls.setting_names(given)
         for name in given:
             if name not in known:

@@ -56,12 +56,10 @@ class Stopwatch:
         return self._paused if since is None else self._paused + time.perf_counter() - since
 
     def leave_out(self, seconds: float) -> None:
-        """Leave out some seconds of the time so far."""
         self._paused += seconds
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Leave the time of the block out."""
         begin = self._paused_since = time.perf_counter()
         try:
             yield
@@ -93,18 +91,6 @@ class SolveRun:
         check_interval: Number of steps between checks for failures (paper, section VI-A); a solution keeps the margin
             at all steps.
         judged: Whether a solution must pass :func:`d4orm_env.verify` too.
-
-    Attributes:
-        watch: Time used.
-        current: The candidate that the next iteration starts from.
-        best: The best candidate so far.
-        iteration: Iterations done.
-        denoising_time: Seconds that were spent denoising.
-        state: State of the planner between its own iterations, of a type of its own; ``None`` before the first one.
-        metrics: Numbers of the method's own that the plan's metrics will have.
-        time_limit: Seconds that the solve may take, or ``None``.
-        watcher: Observer of every denoising step, or ``None``.
-        cancelled: Once set, by whatever thread, the iteration under way is left as if its time were over.
     """
 
     def __init__(
@@ -123,7 +109,7 @@ class SolveRun:
         self.engine = engine or get_sampling_engine(planner.config.engine)
         self.seed = whole_number(seed, "seed", 0)
         controls = _first_controls(problem, initial_controls)
-        self.watch = Stopwatch()
+        self.watch = Stopwatch()  #: Time used
         with self.watch.paused():
             # The first rollout may compile.
             self.engine.rollout(problem, controls)
@@ -132,16 +118,17 @@ class SolveRun:
         of_controls = partial(
             evaluate_controls, self.engine, problem, check_interval=self.check_interval, judged=judged
         )
-        self.current = self.best = of_controls(controls)
+        self.current = self.best = of_controls(controls)  #: What the next iteration starts from, and the best so far
         self._evaluate = evaluate or of_controls
-        self.iteration = self.denoising_steps = 0
-        self.denoising_time = 0.0
+        self.iteration = self.denoising_steps = 0  #: Done so far
+        self.denoising_time = 0.0  #: Seconds that were spent denoising
         self.history: list[IterationRecord] = []
-        self.state: State = None
+        self.state: State = None  #: The planner's, of a type of its own; ``None`` before its first iteration
         self._began = False
-        self.metrics: dict[str, float] = {}
-        self.time_limit: float | None = None
-        self.watcher: StepWatcher | None = None
+        self.metrics: dict[str, float] = {}  #: Numbers of the method's own that the plan's metrics will have
+        self.time_limit: float | None = None  #: Seconds that the solve may take, or ``None``
+        self.watcher: StepWatcher | None = None  #: Observer of every denoising step, or ``None``
+        #: Once set, by whatever thread, the iteration under way is left as if its time were over
         self.cancelled = threading.Event()
 
     @property
@@ -246,7 +233,6 @@ class SolveRun:
             self.planner.finish(self, self.state)
 
     def plan(self, status: Status) -> Plan:
-        """The best candidate as a plan."""
         # Nodes may have reported a solution while they were closed.
         if self.is_over and status in ("iteration_limit", "time_limit"):
             status = "solved"

@@ -23,30 +23,20 @@ if TYPE_CHECKING:
 else:
     path_index = LazyModule("d4orm_planners.engine.path_index")
 
-MISSED_GOAL = 5
-"""Cost of not arriving, or of touching an obstacle, in robots met."""
+MISSED_GOAL = 5  #: Cost of not arriving, or of touching an obstacle, in robots met
 
 
 class WorkingPlan:
-    """The team's plan, to be changed for some robots around all others.
+    """The team's plan, at first this trajectory, with its report if there is one, to be changed for some robots.
 
-    Args:
-        search: The search.
-        trajectory: The team's motion at first.
-        report: Report of :func:`~d4orm_env.verify` on that, if it was asked.
-
-    Attributes:
-        controls: ``(H, K, m)``.
-        states: ``(H+1, K, n)``.
-        arrived: ``(K,)`` whether each ends at its goal.
-        reported: ``(K,)`` step of each robot's fault in the report; ``H + 1`` for none, or once it moves.
-        index: Positions of all robots.
+    It has ``controls`` ``(H, K, m)`` and ``states`` ``(H+1, K, n)``.
     """
 
     def __init__(self, search: SolveRun, trajectory: Trajectory, report: VerificationReport | None = None) -> None:
         self.search, self.problem = search, search.problem
         self.controls, self.states = trajectory.controls.copy(), trajectory.states.copy()
-        self.arrived: BoolArray = trajectory.arrived[-1].copy()
+        self.arrived: BoolArray = trajectory.arrived[-1].copy()  #: ``(K,)`` whether each ends at its goal
+        #: ``(K,)`` step of each robot's fault in the report; ``H + 1`` for none, or once it moves
         self.reported = np.full(self.problem.num_robots, self.problem.horizon + 1)
         arrivals = arrival_steps(trajectory.arrived)
         for violation in () if report is None else report.violations:
@@ -56,6 +46,7 @@ class WorkingPlan:
             self.reported[robots] = np.minimum(self.reported[robots], step)
         # The engine, in float32, must not find near what this has found clear.
         margin = self.problem.margin + self.problem.rounding
+        #: Positions of all robots
         self.index = path_index.team_index(self.problem.team, trajectory.positions, margin)
         self._interval = search.check_interval
         # Who fails is looked for at some steps only, paths around others are at all of them.
@@ -142,14 +133,10 @@ class WorkingPlan:
         return faults + moves / (horizon + 1), np.minimum(np.minimum(meeting, touching), unsure)
 
 
-TURNS = (0, 8, 16, 32, 64)
-"""Steps before a robot's arrival, or its nearest approach, at which it may turn straight to its goal."""
-BATCH = 64
-"""Robots that look for final approaches at the same time: all paths of a big team take room."""
-EARLIER = (1, 2, 4, 8)
-"""Steps before its arrival from which on a robot drives further in."""
-SHARES = (1.0, 0.5, 0.75, 0.25)
-"""Shares of its control in the first of these steps: a stride that ends at the radius must begin elsewhere."""
+TURNS = (0, 8, 16, 32, 64)  #: Steps before a robot's arrival, or nearest approach, to turn straight to its goal at
+BATCH = 64  #: Robots that look for final approaches at the same time: all paths of a big team take room
+EARLIER = (1, 2, 4, 8)  #: Steps before its arrival from which on a robot drives further in
+SHARES = (1.0, 0.5, 0.75, 0.25)  #: Shares of its control in the first of these: strides to the radius begin elsewhere
 
 
 def approach_goals(

@@ -18,8 +18,7 @@ from d4orm_env.core.arrays import BoolArray, Floats, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 
-MOST_PENALTY = 5e7
-"""Largest weight of the constraints, as in the authors' code: it would overflow in the end."""
+MOST_PENALTY = 5e7  #: Largest weight of the constraints, as in the authors' code: it would overflow in the end
 
 
 class Method(NamedTuple):
@@ -197,8 +196,7 @@ def _square_gap(position: Floats, low: Floats, high: Floats) -> float:
 def _push(position: Floats, low: Floats, high: Floats, least: float, target: Floats) -> float:
     """Add to ``target`` the point nearest to ``position`` that is ``least`` from a box, which may be a point.
 
-    Returns:
-        How far ``position`` is from the box, negative within.
+    Returns how far ``position`` is from the box, negative within.
     """
     distance = math.sqrt(_square_gap(position, low, high))
     if distance > 0.0:

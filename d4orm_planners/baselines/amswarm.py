@@ -27,11 +27,7 @@ from d4orm_planners.tracking.steering import present_velocities, track_velocitie
 
 
 class Swarm:
-    """The robots with their motions of the moment.
-
-    Attributes:
-        violation: The largest violation of a constraint that a motion was left with, in SI units.
-    """
+    """The robots with their motions of the moment."""
 
     def __init__(self, problem: Problem, config: AMSwarmConfig, random: np.random.Generator) -> None:
         self._problem, self._config, self._random = problem, config, random
@@ -51,12 +47,10 @@ class Swarm:
         self._accelerations = np.zeros((team.num_robots, d))
         self._guesses = self._warm_start()
         self._first = self._guesses.position[:, 0], self._guesses.velocity[:, 0]
-        self.violation = 0.0
+        self.violation = 0.0  #: The largest violation of a constraint that a motion was left with, in SI units
 
     def run(self, engine: Engine, should_stop: Callable[[], bool]) -> FloatArray:
-        """``(H, K, m)`` controls, planned and driven step by step until all have arrived or it must stop; the rest is
-        zero.
-        """
+        """``(H, K, m)`` controls, planned and driven until all have arrived or it must stop; the rest is zero."""
         problem = self._problem
         controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
         states, arrived = np.asarray(problem.start), np.zeros(problem.num_robots, bool)
@@ -201,10 +195,8 @@ def _one_step_on(guess: MotionSamples, dt: float) -> MotionSamples:
 class AMSwarmConfig(PlannerConfig):
     """Settings of :class:`AMSwarm`; lengths are in steps of the fastest robot at full speed."""
 
-    #: Runs from start to horizon after which :meth:`Planner.solve` gives up, each with other guesses
-    max_iterations: Count = 20
-    #: Steps that a motion is planned for, of which the first is driven
-    lookahead: Annotated[Count, Field(ge=2, le=1000)] = 40
+    max_iterations: Count = 20  #: Runs, with other guesses each, after which :meth:`Planner.solve` gives up
+    lookahead: Annotated[Count, Field(ge=2, le=1000)] = 40  #: Steps that a motion is planned for; the first is driven
     degree: Annotated[Count, Field(ge=5, le=30)] = 10  #: Of the Bernstein polynomials
     goal_steps: Count = 32  #: Steps at the end of a motion that are to be at the goal
     goal_weight: Positive = 1.0  #: Weight of their squared distances from it
@@ -214,8 +206,7 @@ class AMSwarmConfig(PlannerConfig):
     #: Bodies are avoided that are predicted to come within the safety distance and this; ``None`` is all
     lookout: NotNegative | None = 10.0
     clearance: NotNegative = 0.3  #: Added to every distance to keep, for what is driven between the steps
-    #: Largest perturbation of every guess, so that symmetric teams do not block themselves
-    perturbation: NotNegative = 0.5
+    perturbation: NotNegative = 0.5  #: Largest perturbation of every guess, lest symmetric teams block themselves
     penalty: Positive = 2.0  #: First weight of the constraints
     growth: Annotated[Number, Field(ge=1, le=10)] = 1.05  #: Factor by which it grows from one alternation to the next
     alternations: Steps = 100  #: Of a replanning, at most
@@ -250,7 +241,6 @@ class AMSwarm(Planner):
     config: AMSwarmConfig
 
     def iterate(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
-        """See :meth:`Planner.iterate`: a run of the whole team."""
         _refuse_polygons(search.problem)
         if search.iteration == 0:
             with search.watch.paused():

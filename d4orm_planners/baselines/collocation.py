@@ -22,24 +22,14 @@ from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, Ops
 from d4orm_env.dynamics.transition import TimeStep
 
 casadi: Any = LazyModule("casadi", "planner 'ipopt'", "ipopt")
-
-Expression: TypeAlias = Any
-"""CasADi's matrices, symbolic or of numbers; the library carries no types."""
-
-OBJECTIVE_SCALE = 10.0
-"""Scale of the mean cost of a step, so that IPOPT's tolerance tells good motions from bad ones."""
-
-TINY = 1e-9
-"""Added to squared distances, since the square root has no derivative at zero, in the program's units."""
-
-CERTAIN = 0.98
-"""Share of the tolerance of a goal heading within which a robot faces it beyond doubt."""
-
+Expression: TypeAlias = Any  #: CasADi's matrices, symbolic or of numbers; the library carries no types
+OBJECTIVE_SCALE = 10.0  #: Scale of the mean cost of a step, so that IPOPT's tolerance tells good motions from bad ones
+TINY = 1e-9  #: Added to squared distances, since the square root has no derivative at zero, in the program's units
+CERTAIN = 0.98  #: Share of the tolerance of a goal heading within which a robot faces it beyond doubt
 Contacts = dict[tuple[int, int], NDArray[np.int64]]
 """Steps at which robot ``k`` is kept clear of body ``b``: robot ``b``, or from ``K`` on obstacle ``b - K``."""
 
-Rows = tuple[Expression, float, float]
-"""A matrix of expressions with their lower and their upper bound."""
+Rows = tuple[Expression, float, float]  #: A matrix of expressions with their lower and their upper bound
 
 
 class CollocatedMotion(NamedTuple):
@@ -222,9 +212,7 @@ class TeamProgram:
             yield self.controls[robot], components, -float(lower[column]), float(limits[column])
 
     def _goal_rows(self, arrivals: IntArray) -> Iterator[Rows]:
-        """At the step of its arrival a robot is within the goal radius, no faster than its goal speed, and faces as it
-        is to.
-        """
+        """At its arrival a robot is within the goal radius, at most at its goal speed, and faces as it is to."""
         problem = self.problem
         radius = problem.goal_radius - min(self.clearance, problem.goal_radius / 2)
         for robot, arrival in enumerate(arrivals):

@@ -26,27 +26,15 @@ from d4orm_planners.baselines.collocation import CollocatedMotion, Contacts, Exp
 from d4orm_planners.tracking.steering import prepare_drives, straight_drives
 
 Options = Mapping[str, object]
-
-FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-"""IPOPT's words for a solution of the program."""
-
-OUT_OF_TIME = "No_Time_After_Warm_Start"
-"""Our own word for an iteration that ends with the warm start."""
-
-NEARLY_SOLVED = 1e-2
-"""IPOPT's first barrier parameter in a round that begins where the last one ended."""
-
-FEASIBILITY = 1e-5
-"""Largest violation of a constraint that IPOPT may leave, in the program's units; the clearance makes up for it."""
+FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")  #: IPOPT's words for a solution of the program
+OUT_OF_TIME = "No_Time_After_Warm_Start"  #: Our own word for an iteration that ends with the warm start
+NEARLY_SOLVED = 1e-2  #: IPOPT's first barrier parameter in a round that begins where the last one ended
+FEASIBILITY = 1e-5  #: Largest violation that IPOPT may leave, in the program's units; the clearance makes up for it
 IPOPT = {"print_level": 0, "sb": "yes", "constr_viol_tol": FEASIBILITY}
-CASADI = {"print_time": False, "show_eval_warnings": False}
-"""Options of every solve."""
-ABANDONED = "Abandoned_At_Time_Limit"
-"""Status of a run that was left before IPOPT could end it."""
-LOOK = 0.01
-"""Period of asking the caller whether to stop [s]."""
-GRACE = 0.05
-"""Time that work which was asked to end is waited for [s]."""
+CASADI = {"print_time": False, "show_eval_warnings": False}  #: Options of every solve
+ABANDONED = "Abandoned_At_Time_Limit"  #: Status of a run that was left before IPOPT could end it
+LOOK = 0.01  #: Period of asking the caller whether to stop [s]
+GRACE = 0.05  #: Time that work which was asked to end is waited for [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +51,7 @@ class IpoptConfig(PlannerConfig):
     #: Solves per restart. As long as the rollout does not keep the margin, the next one begins where the last one
     #: ended; what came near is avoided too, and robots stay where they arrived. The paper solves once.
     rounds: Count = 8
-    #: Added to every distance to keep, for what rounding and tolerances take away, in the same steps
-    clearance: NotNegative = 0.02
+    clearance: NotNegative = 0.02  #: Added to every distance to keep, for rounding and tolerances, in the same steps
     tolerance: Positive = 1e-3  #: IPOPT's, on the scaled optimality error
     barrier: Positive = 1.0  #: IPOPT's first barrier parameter
     #: IPOPT's own iterations in each solve
@@ -83,10 +70,7 @@ class Ipopt(Planner):
     """Direct collocation of the whole team, solved by IPOPT: without collisions first, then, perturbed, with them.
 
     Maximises the other planners' reward (paper, section III-D) under Eq. 1. Every iteration is another perturbation of
-    the same warm start, or of the initial controls where there are any.
-
-    Raises:
-        ImportError: If CasADi is not installed.
+    the same warm start, or of the initial controls where there are any. ImportError without CasADi.
     """
 
     name: ClassVar[str] = "ipopt"
@@ -104,7 +88,6 @@ class Ipopt(Planner):
         return WarmStart(program, self._warm_start(search, program))
 
     def iterate(self, search: SolveRun, state: WarmStart) -> tuple[WarmStart, Iteration]:
-        """See :meth:`Planner.iterate`: one perturbed restart."""
         if search.should_stop():
             return state, Iteration(state.motion.controls.astype(np.float32), note=OUT_OF_TIME)
         return state, self._restart(search, state)

@@ -33,13 +33,9 @@ if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
 pyrvo: Any = LazyModule("pyrvo", "policy 'orca'", "orca")
-
-NEARBY = 4.0
-"""Distance from its goal within which a robot goes by curves to its goal heading, in radii of its turning circle."""
-UNDISTURBED = 1e-3
-"""Share of its speed limit by which nobody who is near changes a robot's velocity."""
-CORNERS = 16
-"""Corners of the polygons that stand for round obstacles and robots at rest."""
+NEARBY = 4.0  #: Distance from its goal within which a robot goes by curves to its goal heading, in turning radii
+UNDISTURBED = 1e-3  #: Share of its speed limit by which nobody who is near changes a robot's velocity
+CORNERS = 16  #: Corners of the polygons that stand for round obstacles and robots at rest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,16 +43,13 @@ class OrcaConfig(CheckedSettings):
     """Settings of :class:`Orca`."""
 
     time_horizon: Positive = 1.0  #: For this long the new velocities keep the robots apart [s]
-    #: The same for obstacles, bounds and arrived robots, which do not give way [s]
-    obstacle_time_horizon: Positive = 1.0
-    #: Robots farther away than this are not looked at, in steps of the fastest at full speed
-    neighbor_distance: Positive = 100.0
+    obstacle_time_horizon: Positive = 1.0  #: The same for obstacles, bounds and arrived robots, which do not yield [s]
+    neighbor_distance: Positive = 100.0  #: Farther robots are not looked at, in steps of the fastest at full speed
     max_neighbors: Annotated[Whole, Field(ge=0, le=10**6)] = 10  #: So many of the nearest robots are looked at
     #: Added to every robot's radius [m]; by default the problem's margin. Two robots so keep twice that distance, which
     #: leaves robots with inertia some room: they cannot take a new velocity at once.
     clearance: NotNegative | None = None
-    #: Whether robots prefer to follow their shortest paths among obstacles, or else the straight line
-    shortest_paths: bool = True
+    shortest_paths: bool = True  #: Whether robots prefer their shortest paths among obstacles to the straight line
     #: Standard deviation of the angle by which each robot's preferred velocity is turned, drawn once per episode [rad].
     #: Without it robots in a symmetric formation block each other, as the authors note.
     deviation: NotNegative = 0.1

@@ -20,6 +20,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 from typer.core import TyperCommand, TyperGroup
 
 from d4orm_env.scenarios.settings import Settings
@@ -31,10 +32,7 @@ if TYPE_CHECKING:
 
 # Typer carries its own copy of click, whose base class it does not export.
 ClickException: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
-
-LONGEST = 2000
-"""Characters of a complaint at most: a name that was given may have any number."""
-
+LONGEST = 2000  #: Characters of a complaint at most: a name that was given may have any number
 
 INSTEAD = {
     "planner": ("--policy", "here it is --policy"),
@@ -117,7 +115,6 @@ class Commands(TyperGroup):
             formatter.write_dl([(name, help_) for name, (_, help_) in COMMANDS.items()])
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command that was chosen."""
         try:
             return super().invoke(ctx)
         except EOFError as error:
@@ -125,11 +122,7 @@ class Commands(TyperGroup):
 
 
 app = typer.Typer(
-    name="d4orm",
-    cls=Commands,
-    add_completion=False,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
+    name="d4orm", cls=Commands, add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False
 )
 
 
@@ -143,7 +136,7 @@ def _tell_version(wanted: bool) -> None:
 def options(
     context: typer.Context,
     version: Annotated[
-        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Show the version and exit.")
+        bool, Option("--version", callback=_tell_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
     """Plan and run teams of robots that cross each other's way without touching."""

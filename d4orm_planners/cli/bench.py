@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from d4orm_planners.cli.options import MOST_SEEDS, Quiet, names, numbers
 from d4orm_planners.cli.outputs import output_folder, parts_progress, tell_written
@@ -16,21 +16,13 @@ from d4orm_planners.evaluation.measuring import QUICK, SECTIONS, BenchmarkSettin
 
 
 def bench(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write bench.json and bench.md to.")] = Path(
-        "bench"
-    ),
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Small sizes and few repetitions on the CPU engine, about a minute.")
-    ] = False,
-    num_robots: Annotated[
-        str | None, typer.Option("--num-robots", "--robots", "-k", help="Team sizes, as 4,8,16.")
-    ] = None,
-    models: Annotated[str | None, typer.Option(help="Robot models, separated by commas.")] = None,
-    engines: Annotated[str | None, typer.Option(help="Of cpu, jax and plain, with commas.")] = None,
-    sections: Annotated[
-        str | None, typer.Option(help=f"Of {', '.join(SECTIONS)}, with commas; all by default.")
-    ] = None,
-    seeds: Annotated[int | None, typer.Option(max=MOST_SEEDS, help="Seeds for the first feasible plan.")] = None,
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write bench.json and bench.md to.")] = Path("bench"),
+    quick: Annotated[bool, Option("--quick", help="Small sizes, few repetitions on the CPU, about a minute.")] = False,
+    num_robots: Annotated[str | None, Option("--num-robots", "--robots", "-k", help="Team sizes, as 4,8,16.")] = None,
+    models: Annotated[str | None, Option(help="Robot models, separated by commas.")] = None,
+    engines: Annotated[str | None, Option(help="Of cpu, jax and plain, with commas.")] = None,
+    sections: Annotated[str | None, Option(help=f"Of {', '.join(SECTIONS)}, with commas; all by default.")] = None,
+    seeds: Annotated[int | None, Option(max=MOST_SEEDS, help="Seeds for the first feasible plan.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Measure the engines, the environments and the planner on this machine."""

@@ -6,9 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import Annotated, TypeVar
 
 import typer
+from typer import Argument, Option
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.base.display import one_line
@@ -35,26 +36,19 @@ from d4orm_planners.evaluation.leaderboard import leaderboard as page
 from d4orm_planners.evaluation.robustness import tolerance_tables, write_disturbances, write_robustness
 from d4orm_planners.evaluation.store import TrialStore
 from d4orm_planners.evaluation.study import Study
-from d4orm_planners.evaluation.summary import success_rates
+from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates
 from d4orm_planners.evaluation.tables import PARQUET_HINT, markdown, read_parquet, write_results
-
-if TYPE_CHECKING:
-    from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup
 
 T = TypeVar("T")
 
 NoiseLevels = Annotated[
-    str | None,
-    typer.Option("--control-noise-std", "--noise", help="Standard deviations of the execution noise, as 0,0.1."),
+    str | None, Option("--control-noise-std", "--noise", help="Standard deviations of the execution noise, as 0,0.1.")
 ]
 DisturbanceLevels = Annotated[
     list[str] | None,
-    typer.Option(
-        "--disturb", help="Levels of a disturbance, as delay=0,1,2 or push(rate=1).speed=0.2,0.5; repeatable."
-    ),
+    Option("--disturb", help="Levels of a disturbance, as delay=0,1,2 or push(rate=1).speed=0.2,0.5; repeatable."),
 ]
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to go on from.")]
-
+Out = Annotated[Path, Option("--out", "-o", help="Folder to write to, and to go on from.")]
 
 STANDARD = (
     "control_noise=0,0.1,0.2,0.3",
@@ -72,9 +66,7 @@ STANDARD = (
 )
 """Levels that are run where none are named, from harmless to bad; all robot models have these disturbances."""
 
-
-OF_RAYS = "ray_noise=0,0.02,0.05,0.1"
-"""One more where robots have range sensors."""
+OF_RAYS = "ray_noise=0,0.02,0.05,0.1"  #: One more where robots have range sensors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +75,7 @@ class StudyOptions(ObservationOptions):
 
     policies: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--policy",
             "--policies",
             "-p",
@@ -92,35 +84,34 @@ class StudyOptions(ObservationOptions):
         ),
     ] = None
     scenario: Annotated[
-        str, typer.Option("--scenario", "--scenarios", "-s", help="Scenarios or YAML files, separated by commas.")
+        str, Option("--scenario", "--scenarios", "-s", help="Scenarios or YAML files, separated by commas.")
     ] = "circle"
     num_robots: Annotated[
-        str | None,
-        typer.Option("--num-robots", "--robots", "-k", help="Team sizes, as 4,8; the scenario's own by default."),
+        str | None, Option("--num-robots", "--robots", "-k", help="Team sizes, as 4,8; the scenario's own by default.")
     ] = None
     model: Annotated[
-        str | None, typer.Option("--model", "-m", help="Robot models, as car,unicycle; the scenario's own by default.")
+        str | None, Option("--model", "-m", help="Robot models, as car,unicycle; the scenario's own by default.")
     ] = None
     scenario_settings: ScenarioSettings = None
     seeds: Annotated[
-        str, typer.Option("--seeds", "--trials", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8.")
+        str, Option("--seeds", "--trials", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8.")
     ] = "50"
     control_noise_std: NoiseLevels = "0"
     disturb: DisturbanceLevels = None
     physics: Physics = "model"
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", help="A setting of all policies that have it, or of one, as orca.time_horizon=2."),
+        Option("--set", help="A setting of all policies that have it, or of one, as orca.time_horizon=2."),
     ] = None
     time_limit: TimeLimit = None
-    trial_timeout: Annotated[float | None, typer.Option(help="Seconds after which a trial ends with an error.")] = None
+    trial_timeout: Annotated[float | None, Option(help="Seconds after which a trial ends with an error.")] = None
     workers: Workers = None
-    ray: Annotated[str | None, typer.Option(help="Address of a Ray cluster to run on, or auto; needs ray.")] = None
+    ray: Annotated[str | None, Option(help="Address of a Ray cluster to run on, or auto; needs ray.")] = None
     shard: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Run only a part, as 3/20, the third of twenty, in a job array; afterwards the same command without "
-            "it puts all together.",
+            "it puts all together."
         ),
     ] = None
     out: Out = Path("evaluation")
@@ -243,13 +234,10 @@ def robustness(options: RobustnessOptions) -> None:
 
 def leaderboard(
     stores: Annotated[
-        list[Path],
-        typer.Argument(help="Folders that d4orm evaluate wrote to, or their trials.sqlite or trials.parquet."),
+        list[Path], Argument(help="Folders that d4orm evaluate wrote to, or their trials.sqlite or trials.parquet.")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Page to write, .md.")] = Path("leaderboard.md"),
-    deadlines: Annotated[
-        str | None, typer.Option(help="Seconds for planning, as 0.1,0.5,1: success within them.")
-    ] = None,
+    out: Annotated[Path, Option("--out", "-o", help="Page to write, .md.")] = Path("leaderboard.md"),
+    deadlines: Annotated[str | None, Option(help="Seconds for planning, as 0.1,0.5,1: success within them.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a page with the results of all trials in a store, or in several."""

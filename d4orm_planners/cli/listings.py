@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated
 
-import typer
+from typer import Argument
 
 from d4orm_env.scenarios import describe_scenario, list_scenarios
 from d4orm_planners.base.names import PLANNERS, POLICIES
@@ -19,7 +19,7 @@ def scenarios() -> None:
 
 
 def planners(
-    name: Annotated[str | None, typer.Argument(help="List the settings of this one, with their defaults.")] = None,
+    name: Annotated[str | None, Argument(help="List the settings of this one, with their defaults.")] = None,
 ) -> None:
     """List the planners and policies, or what --set can set of one, and its presets."""
     if name is not None:

@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import typer
+from typer import Option
 
 from d4orm_env.core.arrays import duration, truth, whole_number
 from d4orm_env.core.errors import unknown
@@ -22,6 +23,7 @@ from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.schema import VERSION, parse
 from d4orm_planners.base.controller import Controller
 from d4orm_planners.base.disturbance_observer import DisturbanceObserver
+from d4orm_planners.base.plan import IterationRecord
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.cli import on_signals
 from d4orm_planners.cli.outputs import check_target
@@ -30,9 +32,6 @@ from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings
 from d4orm_planners.serve.fleet_server import NODE, FleetServer
 from d4orm_planners.serve.wire import WIRES, RosSession
 
-if TYPE_CHECKING:
-    from d4orm_planners.base.plan import IterationRecord
-
 T = TypeVar("T")
 
 REQUIRED = ("node", "nodes", "problem", "time_limit", "out")
@@ -40,8 +39,7 @@ OPTIONAL = ("seed", "settings", "zenoh")
 OWN = ("node", "nodes", "mode", "transport", "zenoh")
 """Settings of the planner that are not among ``settings``: they have a field of their own, or are given."""
 
-ENDLESS = 10**9
-"""Iterations; a node's budget is its time."""
+ENDLESS = 10**9  #: Iterations; a node's budget is its time
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,6 @@ class NodeTask:
 
 
 def load_node(path: str | os.PathLike[str]) -> NodeTask:
-    """Read a node's file, see :func:`read_task`."""
     return read_task(path, REQUIRED, OPTIONAL, _task)
 
 
@@ -130,7 +127,6 @@ def mapping(name: str, content: object) -> Mapping[str, Any]:
 
 
 def zenoh_in(fields: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
-    """The settings of zenoh in a file."""
     zenoh = mapping("zenoh", fields.get("zenoh", {}))
     if isinstance(zenoh.get("config_file"), str):
         zenoh = {**zenoh, "config_file": str(folder / zenoh["config_file"])}
@@ -138,7 +134,7 @@ def zenoh_in(fields: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
 
 
 def node(
-    config: Annotated[Path, typer.Option("--config", "-c", help="YAML file that says what the node has to do.")],
+    config: Annotated[Path, Option("--config", "-c", help="YAML file that says what the node has to do.")],
 ) -> None:
     """Plan as one node of several on a network: exchange candidates, end with the best one known, write it."""
     task = load_node(config)
@@ -199,10 +195,8 @@ FIELDS = (
     "wire",
     "stamps",
 )
-CONTROLLER = {"mode", "reserve", "timeout", "lag", "tracker"}
-"""Settings of the controller."""
-SHARE = 0.9
-"""Share of a period that the policy may take."""
+CONTROLLER = {"mode", "reserve", "timeout", "lag", "tracker"}  #: Settings of the controller
+SHARE = 0.9  #: Share of a period that the policy may take
 
 
 @dataclass(frozen=True)
@@ -220,9 +214,7 @@ class ServeTask:
     stamps: bool
 
 
-def serve(
-    config: Annotated[Path, typer.Option("--config", "-c", help="YAML file that says what is to be served.")],
-) -> None:
+def serve(config: Annotated[Path, Option("--config", "-c", help="YAML file that says what is to be served.")]) -> None:
     """Drive robots on a ROS 2 network over Zenoh: odometry in, velocities and setpoints out, until Ctrl-C."""
     task, over = read_task(config, FIELDS[:1], FIELDS[1:], _serve_task), threading.Event()
     # Robots are told to stand once it is set.

@@ -11,59 +11,47 @@ import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from functools import wraps
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
+from typer import Option
 
 from d4orm_env import scenarios
 from d4orm_env.core.files import parse_yaml
 from d4orm_env.core.lazy import LazyModule
+from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.base.planner_registry import list_policies
 
-if TYPE_CHECKING:
-    from d4orm_env.core.problem import Problem
-
 T = TypeVar("T")
 N = TypeVar("N", int, float)
-_physics: Any = LazyModule("d4orm_planners.base.physics")
-
-MOST_SEEDS = 1_000_000
-"""Trials of one policy at most: a slip of the finger must not fill the memory."""
+_physics: Any = LazyModule("d4orm_planners.base.episode")
+MOST_SEEDS = 1_000_000  #: Trials of one policy at most: a slip of the finger must not fill the memory
 
 Model = Annotated[
     str | None,
-    typer.Option("--model", "-m", help="Robot model, or one a robot, as car,unicycle; the scenario's own by default."),
+    Option("--model", "-m", help="Robot model, or one a robot, as car,unicycle; the scenario's own by default."),
 ]
 ScenarioSettings = Annotated[
-    list[str] | None,
-    typer.Option("--scenario-set", help="An argument of the scenario, as diameter=8; repeatable."),
+    list[str] | None, Option("--scenario-set", help="An argument of the scenario, as diameter=8; repeatable.")
 ]
-Seed = Annotated[int, typer.Option("--seed", help="Seed of the scenario and of the planner.")]
-Engine = Annotated[str, typer.Option("--engine", help="auto, cpu or jax.")]
-TimeLimit = Annotated[float | None, typer.Option("--time-limit", help="Seconds for planning.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no tables.")]
+Seed = Annotated[int, Option("--seed", help="Seed of the scenario and of the planner.")]
+Engine = Annotated[str, Option("--engine", help="auto, cpu or jax.")]
+TimeLimit = Annotated[float | None, Option("--time-limit", help="Seconds for planning.")]
+Quiet = Annotated[bool, Option("--quiet", "-q", help="No progress and no tables.")]
 ScenarioName = Annotated[
     str,
-    typer.Option(
-        "--scenario", "-s", help="Scenario name (see `d4orm scenarios`), a YAML file or package.module:function."
-    ),
+    Option("--scenario", "-s", help="Scenario name (see `d4orm scenarios`), a YAML file or package.module:function."),
 ]
-NumRobots = Annotated[
-    int | None, typer.Option("--num-robots", "--robots", "-k", help="Number of robots; the scenario's own by default.")
-]
+NumRobots = Annotated[int | None, Option("--num-robots", "--robots", "-k", help="Robots; by default the scenario's.")]
 Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="A setting of the planner or policy, as num_samples=512; repeatable."),
+    list[str] | None, Option("--set", help="A setting of the planner or policy, as num_samples=512; repeatable.")
 ]
-NoiseLevel = Annotated[
-    float, typer.Option("--control-noise-std", "--noise", help="Standard deviation of the execution noise.")
-]
+NoiseLevel = Annotated[float, Option("--control-noise-std", "--noise", help="Standard deviation of execution noise.")]
 Disturb = Annotated[
-    list[str] | None,
-    typer.Option("--disturb", help="A disturbance at a level, as delay=2 or push.speed=0.3; repeatable."),
+    list[str] | None, Option("--disturb", help="A disturbance at a level, as delay=2 or push.speed=0.3; repeatable.")
 ]
-Workers = Annotated[int | None, typer.Option("--workers", "-j", help="Processes; all cores by default.")]
+Workers = Annotated[int | None, Option("--workers", "-j", help="Processes; all cores by default.")]
 
 
 def takes(options: type[T]) -> Callable[[Callable[[T], None]], Callable[..., None]]:
@@ -89,20 +77,20 @@ def takes(options: type[T]) -> Callable[[Callable[[T], None]], Callable[..., Non
 class ObservationOptions:
     """Options on what robots observe; what is not given is as the environment has it."""
 
-    observed_robots: Annotated[int | None, typer.Option(help="Nearest robots in an observation.")] = None
-    observed_obstacles: Annotated[int | None, typer.Option(help="Nearest obstacles in an observation.")] = None
+    observed_robots: Annotated[int | None, Option(help="Nearest robots in an observation.")] = None
+    observed_obstacles: Annotated[int | None, Option(help="Nearest obstacles in an observation.")] = None
     observed_rays: Annotated[
-        int | None, typer.Option(help="Rays of every robot's range sensor; noise: --disturb ray_noise=0.02.")
+        int | None, Option(help="Rays of every robot's range sensor; noise: --disturb ray_noise=0.02.")
     ] = None
-    ray_range: Annotated[float | None, typer.Option(help="Range of these [m].")] = None
+    ray_range: Annotated[float | None, Option(help="Range of these [m].")] = None
     observed_path: Annotated[
-        bool | None, typer.Option("--observed-path", help="Direction and length of the shortest path.")
+        bool | None, Option("--observed-path", help="Direction and length of the shortest path.")
     ] = None
-    communication_range: Annotated[
-        float | None, typer.Option(help="Distance beyond which no neighbour is observed [m].")
-    ] = None
+    communication_range: Annotated[float | None, Option(help="Distance beyond which no neighbour is observed [m].")] = (
+        None
+    )
     line_of_sight: Annotated[
-        bool | None, typer.Option("--line-of-sight", help="Neighbours behind obstacles are not observed either.")
+        bool | None, Option("--line-of-sight", help="Neighbours behind obstacles are not observed either.")
     ] = None
 
     @property
@@ -119,7 +107,7 @@ def _imported(physics: str) -> str:
 
 Physics = Annotated[
     str,
-    typer.Option(
+    Option(
         "--physics",
         callback=_imported,
         help="What moves the robots: model, as planners know them, mujoco or crazyflow; with settings, as "
@@ -136,14 +124,13 @@ class ProblemOptions:
     scenario: ScenarioName = "circle"
     num_robots: NumRobots = None
     model: Model = None
-    num_obstacles: Annotated[
-        int | None, typer.Option("--num-obstacles", "--obstacles", help="Random obstacles to add.")
-    ] = None
+    num_obstacles: Annotated[int | None, Option("--num-obstacles", "--obstacles", help="Random obstacles to add.")] = (
+        None
+    )
     scenario_settings: ScenarioSettings = None
     seed: Seed = 0
 
     def problem(self) -> Problem:
-        """The problem."""
         common = ("num_robots", "model", "num_obstacles")
         if is_scenario_file(self.scenario):
             reason = f"does not go with a scenario file; change it in {self.scenario}"
@@ -217,9 +204,7 @@ def _add(values: dict[str, object], name: str, text: str, option: str, what: str
 
 
 def policies_by_label(texts: list[str], option: str = "--policy") -> dict[str, dict[str, object]]:
-    """``policy`` and settings by label: a name stands for itself, a configuration for what was typed, or what it sets
-    as label.
-    """
+    """``policy`` and settings by label: a name is its own, a configuration's is what was typed, or what it sets."""
     labelled: list[tuple[str, dict[str, object]]] = []
     for text in texts:
         # The name ends where the first setting begins, for an import path has a colon too.

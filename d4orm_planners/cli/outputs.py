@@ -17,26 +17,23 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
+from typer import Option
 
 from d4orm_env import render
 from d4orm_env.core.files import make_folder, target_of
 from d4orm_env.core.infeasibility import prove_infeasible
+from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import count
+from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory
 from d4orm_planners.base.display import one_line
-from d4orm_planners.base.plan import IterationRecord
+from d4orm_planners.base.plan import IterationRecord, Plan
 from d4orm_planners.cli.options import Quiet
 
 if TYPE_CHECKING:
-    from d4orm_env.core.problem import Problem
-    from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory
     from d4orm_planners.base.episode import Episode
-    from d4orm_planners.base.plan import Plan
 
-LOG_INTERVAL = 60.0
-"""Seconds between lines of progress where there is no terminal."""
-
-MOST_REASONS = 20
-"""Robots of which it is told why they fail."""
+LOG_INTERVAL = 60.0  #: Seconds between lines of progress where there is no terminal
+MOST_REASONS = 20  #: Robots of which it is told why they fail
 
 
 @contextmanager
@@ -76,8 +73,8 @@ def check_target(path: Path | None, suffixes: tuple[str, ...]) -> None:
 class PictureOptions:
     """Options on pictures, and on how much to say."""
 
-    picture: Annotated[Path | None, typer.Option(help="Picture to write: .png, .svg or .pdf.")] = None
-    animation: Annotated[Path | None, typer.Option(help="Animation to write: .gif or .mp4.")] = None
+    picture: Annotated[Path | None, Option(help="Picture to write: .png, .svg or .pdf.")] = None
+    animation: Annotated[Path | None, Option(help="Animation to write: .gif or .mp4.")] = None
     quiet: Quiet = False
 
     def check_pictures(self) -> None:
@@ -96,7 +93,6 @@ class PictureOptions:
 
 
 def episode_rows(episode: Episode) -> list[tuple[str, str]]:
-    """Return the key figures of an episode."""
     metrics = episode.metrics
     return [
         ("success", "yes" if metrics["success"] else "no"),
@@ -114,7 +110,6 @@ def _finite(stretch: float) -> str:
 
 
 def print_plan(plan: Plan) -> None:
-    """Print how a plan was found and how good it is."""
     metrics = plan.metrics
     rows = [
         ("solved", "yes" if plan.solved else f"no ({plan.status})"),
@@ -132,7 +127,6 @@ def print_plan(plan: Plan) -> None:
 
 
 def print_table(title: str, rows: list[tuple[str, str]]) -> None:
-    """Rows without a header."""
     table = Table(title=Text(one_line(title)), title_justify="left", show_header=False)
     for row in rows:
         table.add_row(*(Text(one_line(cell)) for cell in row))
@@ -226,13 +220,11 @@ def _live_line(columns: Iterable[ProgressColumn], enabled: bool) -> Iterator[Pro
 
 
 def tell_results(text: str, written: Iterable[Path]) -> None:
-    """Print tables, and which files were written."""
     typer.echo(text)
     tell_written(*written)
 
 
 def tell_written(*paths: Path | None, quiet: bool = False) -> None:
-    """Print which files were written, as far as there are any."""
     for path in paths:
         if path is not None and not quiet:
             typer.echo(f"wrote {path}")

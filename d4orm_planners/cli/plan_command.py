@@ -5,13 +5,16 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import typer
+from typer import Argument, Option
 
+from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import load_reference
 from d4orm_planners.base.plan import Plan
+from d4orm_planners.base.planner import Callback, Planner
 from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner
 from d4orm_planners.cli.options import (
     Engine,
@@ -35,10 +38,6 @@ from d4orm_planners.cli.outputs import (
 from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.hybrid.compile_ahead import compile_for_planning
 
-if TYPE_CHECKING:
-    from d4orm_env.core.problem import Problem
-    from d4orm_planners.base.planner import Callback, Planner
-
 
 @dataclass(frozen=True, kw_only=True)
 class PlanOptions(PictureOptions, ProblemOptions):
@@ -46,19 +45,19 @@ class PlanOptions(PictureOptions, ProblemOptions):
 
     planner: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--planner",
             "-p",
             help="Planner (see `d4orm planners`), or package.module:Name.",
             show_default="that of make_planner()",
         ),
     ] = None
-    preset: Annotated[str | None, typer.Option(help="`paper`, `authors` or `tuned`; see `d4orm planners NAME`.")] = None
+    preset: Annotated[str | None, Option(help="`paper`, `authors` or `tuned`; see `d4orm planners NAME`.")] = None
     settings: Settings = None
     engine: Engine = "auto"
     time_limit: TimeLimit = None
-    max_iterations: Annotated[int | None, typer.Option(help="Iterations for planning.")] = None
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Plan file (.npz) or replay (.html) to write.")] = None
+    max_iterations: Annotated[int | None, Option(help="Iterations for planning.")] = None
+    out: Annotated[Path | None, Option("--out", "-o", help="Plan file (.npz) or replay (.html) to write.")] = None
 
 
 @takes(PlanOptions)
@@ -103,23 +102,20 @@ def read_plan(path: Path, scenario: str | None) -> Plan:
 
 
 def export(
-    plan_file: Annotated[Path, typer.Argument(help="Plan to export, .npz.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")],
+    plan_file: Annotated[Path, Argument(help="Plan to export, .npz.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder for the files.")],
     format: Annotated[
-        str, typer.Option("--format", "-f", help="csv, crazyswarm2, rosbag2 or mcap.", show_default=True)
+        str, Option("--format", "-f", help="csv, crazyswarm2, rosbag2, mcap.", show_default=True)
     ] = "csv",
-    rate: Annotated[
-        float | None, typer.Option(help="Setpoints per second; polynomials have none.", show_default="100")
-    ] = None,
-    height: Annotated[float, typer.Option(help="z of a team that moves in the plane [m].")] = 0.0,
+    rate: Annotated[float | None, Option(help="Setpoints a second; polynomials have none.", show_default="100")] = None,
+    height: Annotated[float, Option(help="z of a team that moves in the plane [m].")] = 0.0,
     max_acceleration: Annotated[
-        float | None,
-        typer.Option(help="Limit of the setpoints [m/s^2].", show_default="the team's"),
+        float | None, Option(help="Limit of the setpoints [m/s^2].", show_default="the team's")
     ] = None,
     scenario: Annotated[
-        str | None, typer.Option("--scenario", "-s", help="package.module:function whose module registers its robots.")
+        str | None, Option("--scenario", "-s", help="package.module:function whose module registers its robots.")
     ] = None,
-    max_jerk: Annotated[float | None, typer.Option(help="Limit of the setpoints [m/s^3].", show_default="none")] = None,
+    max_jerk: Annotated[float | None, Option(help="Limit of the setpoints [m/s^3].", show_default="none")] = None,
 ) -> None:
     """Smooth a plan, verify it again, and write setpoints for robots to execute."""
     if rate is not None and format == "crazyswarm2":

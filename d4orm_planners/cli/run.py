@@ -13,15 +13,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import rich
 import typer
+from typer import Argument, Option
 
 from d4orm_env import make_problem, navigation_v0, verify
+from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import count
+from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.render import save_animation, save_picture
 from d4orm_env.render.replay import Replay, save_denoising
-from d4orm_planners.base.episode import open_env, run_episode
+from d4orm_planners.base.episode import Episode, open_env, run_episode
+from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner, make_policy
-from d4orm_planners.base.policy import OpenLoop
+from d4orm_planners.base.policy import OpenLoop, Policy
 from d4orm_planners.cli import on_signals
 from d4orm_planners.cli.options import (
     Disturb,
@@ -52,47 +56,39 @@ from d4orm_planners.cli.plan_command import read_plan, solving
 from d4orm_planners.sampling.denoising import DenoisingFilm
 
 if TYPE_CHECKING:
-    from d4orm_env.core.problem import Problem
-    from d4orm_env.disturbances.disturbance import AnyDisturbance
-    from d4orm_planners.base.episode import Episode
-    from d4orm_planners.base.plan import Plan
-    from d4orm_planners.base.policy import Policy
     from d4orm_planners.play.playground import Playground
 
-LAST_WAIT = 2.0
-"""Seconds from Ctrl-C of ``d4orm play`` to the end of the process."""
+LAST_WAIT = 2.0  #: Seconds from Ctrl-C of ``d4orm play`` to the end of the process
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(PictureOptions, ObservationOptions, ProblemOptions):
     """Options on the policy and the environment."""
 
-    plan_file: Annotated[Path | None, typer.Argument(help="Plan to execute; plans anew without one.")] = None
+    plan_file: Annotated[Path | None, Argument(help="Plan to execute; plans anew without one.")] = None
     policy: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--policy",
             "-p",
             help="Planner, policy or package.module:Name, with settings behind a colon: ppo:path=mine.zip.",
             show_default="the planner of make_planner()",
         ),
     ] = None
-    preset: Annotated[str | None, typer.Option(help="Preset of the policy, as `paper`.")] = None
+    preset: Annotated[str | None, Option(help="Preset of the policy, as `paper`.")] = None
     control_noise_std: NoiseLevel = 0.0
     compare: Annotated[
         list[str] | None,
-        typer.Option(help="Policies on the same problem and seed, as of `d4orm evaluate --policy`; repeatable."),
+        Option(help="Policies on the same problem and seed, as of `d4orm evaluate --policy`; repeatable."),
     ] = None
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Replay to write, .html.")] = None
+    out: Annotated[Path | None, Option("--out", "-o", help="Replay to write, .html.")] = None
     physics: Physics = "model"
     disturb: Disturb = None
 
     def disturbances(self) -> tuple[AnyDisturbance, ...]:
-        """Return the disturbances."""
         return disturbances_at(single_levels(self.disturb))
 
     def execute(self, problem: Problem, policy: Policy, disturbances: Sequence[AnyDisturbance]) -> Episode:
-        """An episode of a policy on a problem."""
         wrong = {"control_noise_std": self.control_noise_std, "disturbances": disturbances}
         env = open_env(problem, self.physics, policy, **wrong, **self.observation)
         episode = run_episode(env, policy, seed=self.seed)
@@ -100,7 +96,6 @@ class RunOptions(PictureOptions, ObservationOptions, ProblemOptions):
         return episode
 
     def chosen(self) -> tuple[Problem, Policy]:
-        """The problem, and what acts in it."""
         if self.plan_file is None:
             named = policies_by_label([RECOMMENDED if self.policy is None else self.policy])
             if len(named) > 1:
@@ -121,7 +116,6 @@ class RunOptions(PictureOptions, ObservationOptions, ProblemOptions):
 
 
 def _made(label: str, settings: Mapping[str, object]) -> Policy:
-    """The policy of a label of :func:`policies_by_label`."""
     own = {name: value for name, value in settings.items() if name != "policy"}
     return make_policy(str(settings.get("policy", label)), **own)
 
@@ -171,13 +165,11 @@ class PlayOptions(ObservationOptions, ProblemOptions):
     """Options on the first scene, and on the page's address."""
 
     policy: Annotated[
-        str, typer.Option("--policy", "-p", help="What drives (see `d4orm planners`); several, separated by commas.")
+        str, Option("--policy", "-p", help="What drives (see `d4orm planners`); several, separated by commas.")
     ] = "d4orm-c2f"
-    host: Annotated[str, typer.Option(help="Where to be found; elsewhere than here the address has a token.")] = (
-        "127.0.0.1"
-    )
-    port: Annotated[int, typer.Option(help="Port; any free one by default.")] = 0
-    open_browser: Annotated[bool, typer.Option("--open/--no-open", help="Open a browser if there is one.")] = True
+    host: Annotated[str, Option(help="Where to be found; elsewhere than here the address has a token.")] = "127.0.0.1"
+    port: Annotated[int, Option(help="Port; any free one by default.")] = 0
+    open_browser: Annotated[bool, Option("--open/--no-open", help="Open a browser if there is one.")] = True
 
 
 @takes(PlayOptions)
@@ -221,13 +213,11 @@ def has_display() -> bool:
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")] = Path("demo"),
-    num_robots: Annotated[int, typer.Option("--num-robots", "--robots", "-k", help="Number of robots.")] = 16,
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("demo"),
+    num_robots: Annotated[int, Option("--num-robots", "--robots", "-k", help="Number of robots.")] = 16,
     seed: Seed = 0,
     engine: Engine = "auto",
-    denoising: Annotated[
-        bool, typer.Option("--denoising", help="Show how noise turns into a plan instead, on a circle.")
-    ] = False,
+    denoising: Annotated[bool, Option("--denoising", help="Show noise becoming a plan instead, on a circle.")] = False,
 ) -> None:
     """Plan robots across a warehouse, execute the plan in the environment, verify it, and write pictures."""
     with output_folder(out):
@@ -253,7 +243,6 @@ def show_warehouse(out: Path, num_robots: int, seed: int, engine: str) -> None:
 
 
 def _write(plan: Plan, episode: Episode, out: Path) -> dict[str, Path]:
-    """The plan, and its execution as picture, animation and replay."""
     problem, trajectory = plan.problem, episode.trajectory
     files = {
         "plan": out / "plan.npz",

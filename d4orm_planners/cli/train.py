@@ -14,6 +14,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from d4orm_env.core.errors import unknown
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
@@ -50,67 +51,61 @@ class TrainOptions:
     """Options on the training, and on its folder."""
 
     context: typer.Context
-    algorithm: Annotated[str, typer.Argument(help="ppo or sac, or imitation of an expert.")]
-    scenario: Annotated[str, typer.Option("--scenario", "-s", help="What to learn.")] = "random"
-    num_robots: Annotated[int, typer.Option("--num-robots", "--robots", "-k", help="Size of the full team.")] = 4
-    steps: Annotated[float, typer.Option(help="Robot-steps, as 5e6.")] = 5e6
-    seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 0
-    model: Annotated[
-        str | None, typer.Option("--model", "-m", help="Robot model of all; the scenario's own by default.")
-    ] = None
-    num_envs: Annotated[int | None, typer.Option(help="Robots that act at once; 1024 for ppo, 64 for sac.")] = None
-    curriculum: Annotated[bool, typer.Option(help="Begin with smaller teams.")] = False
-    stages: Annotated[int, typer.Option(help="Parts with a checkpoint and an evaluation each.")] = 50
-    start_from: Annotated[Path | None, typer.Option(help="A policy file of the same algorithm that learns on.")] = None
-    network: Annotated[str, typer.Option(help="flat, or sets: neighbours in any order and number.")] = "flat"
-    observed_robots: Annotated[int, typer.Option(help="Neighbours in observations.")] = 4
+    algorithm: Annotated[str, Argument(help="ppo or sac, or imitation of an expert.")]
+    scenario: Annotated[str, Option("--scenario", "-s", help="What to learn.")] = "random"
+    num_robots: Annotated[int, Option("--num-robots", "--robots", "-k", help="Size of the full team.")] = 4
+    steps: Annotated[float, Option(help="Robot-steps, as 5e6.")] = 5e6
+    seed: Annotated[int, Option(help="Of everything that is drawn.")] = 0
+    model: Annotated[str | None, Option("--model", "-m", help="Robot model of all; the scenario's own by default.")] = (
+        None
+    )
+    num_envs: Annotated[int | None, Option(help="Robots that act at once; 1024 for ppo, 64 for sac.")] = None
+    curriculum: Annotated[bool, Option(help="Begin with smaller teams.")] = False
+    stages: Annotated[int, Option(help="Parts with a checkpoint and an evaluation each.")] = 50
+    start_from: Annotated[Path | None, Option(help="A policy file of the same algorithm that learns on.")] = None
+    network: Annotated[str, Option(help="flat, or sets: neighbours in any order and number.")] = "flat"
+    observed_robots: Annotated[int, Option(help="Neighbours in observations.")] = 4
     observed_rays: Annotated[
-        int, typer.Option(help="Rays of every robot's range sensor; noise: --mixture 'rooms 8 disturb.ray_noise=0.02'.")
+        int, Option(help="Rays of every robot's range sensor; noise: --mixture 'rooms 8 disturb.ray_noise=0.02'.")
     ] = 0
-    ray_range: Annotated[float, typer.Option(help="Range of these [m].")] = 5.0
+    ray_range: Annotated[float, Option(help="Range of these [m].")] = 5.0
     shortest_paths: Annotated[
-        bool, typer.Option("--shortest-paths", help="Robots head along their shortest paths; for worlds with walls.")
+        bool, Option("--shortest-paths", help="Robots head along their shortest paths; for worlds with walls.")
     ] = False
-    learning_rate: Annotated[
-        float | None, typer.Option(help="At the beginning; it falls to a tenth. 3e-4 for ppo.")
-    ] = None
+    learning_rate: Annotated[float | None, Option(help="At the beginning; it falls to a tenth. 3e-4 for ppo.")] = None
     learner_settings: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--learner-set", help="Some settings of ppo or sac in Stable-Baselines3, as gradient_steps=8; repeatable."
         ),
     ] = None
     reward_settings: Annotated[
-        list[str] | None,
-        typer.Option("--reward-set", help="A weight of the reward to learn from, as contact=5; repeatable."),
+        list[str] | None, Option("--reward-set", help="A weight of the reward to learn from, as contact=5; repeatable.")
     ] = None
     mixture: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             help="A scenario, team size and settings to train on with others at once, as 'random 8 size=4', or the "
-            "name of a mixture, crowds; repeatable.",
+            "name of a mixture, crowds; repeatable."
         ),
     ] = None
-    validation_worlds: Annotated[int, typer.Option(help="Episodes per evaluation.")] = 100
-    expert: Annotated[str, typer.Option(help="Imitation: whom to imitate.")] = "d4orm-c2f"
+    validation_worlds: Annotated[int, Option(help="Episodes per evaluation.")] = 100
+    expert: Annotated[str, Option(help="Imitation: whom to imitate.")] = "d4orm-c2f"
     expert_settings: Annotated[
         list[str] | None,
-        typer.Option("--expert-set", help="Imitation: a setting of the expert, as num_samples=64; repeatable."),
+        Option("--expert-set", help="Imitation: a setting of the expert, as num_samples=64; repeatable."),
     ] = None
     dataset: Annotated[
-        str | None,
-        typer.Option(help="Imitation: folder or name of a dataset to begin with; recorded by default."),
+        str | None, Option(help="Imitation: folder or name of a dataset to begin with; recorded by default.")
     ] = None
-    episodes: Annotated[int, typer.Option(help="Imitation: episodes to record in each round.")] = 100
-    rounds: Annotated[int, typer.Option(help="Imitation: the first clones the expert, the others are DAgger's.")] = 5
-    epochs: Annotated[int, typer.Option(help="Imitation: how often a round looks at all samples.")] = 20
+    episodes: Annotated[int, Option(help="Imitation: episodes to record in each round.")] = 100
+    rounds: Annotated[int, Option(help="Imitation: the first clones the expert, the others are DAgger's.")] = 5
+    epochs: Annotated[int, Option(help="Imitation: how often a round looks at all samples.")] = 20
     scenario_settings: Annotated[
-        list[str] | None,
-        typer.Option("--scenario-set", "--set", help="An argument of the scenario, as size=4; repeatable."),
+        list[str] | None, Option("--scenario-set", "--set", help="An argument of the scenario, as size=4; repeatable.")
     ] = None
     out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Folder to write to, and to go on from; runs/ALGORITHM by default."),
+        Path | None, Option("--out", "-o", help="Folder to write to, and to go on from; runs/ALGORITHM by default.")
     ] = None
     quiet: Quiet = False
 
@@ -135,7 +130,6 @@ def train(options: TrainOptions) -> None:
 
 
 def _learning(options: TrainOptions) -> Callable[..., TrainingResult]:
-    """The training that was asked for: by reinforcement, or of an expert."""
     training, imitation = _library("training"), _library("imitation")
     if options.algorithm == IMITATION:
         learn, kind, other = imitation.imitate, imitation.ImitationSettings, training.TrainingSettings
@@ -172,37 +166,31 @@ class DatasetOptions(ObservationOptions):
     """Options on demonstrations and their files."""
 
     context: typer.Context
-    policy: Annotated[str, typer.Option("--policy", "-p", help="Planner, policy or package.module:Name.")] = "d4orm-c2f"
+    policy: Annotated[str, Option("--policy", "-p", help="Planner, policy or package.module:Name.")] = "d4orm-c2f"
     settings: Settings = None
     scenario: ScenarioName = "random"
     num_robots: NumRobots = None
     model: Model = None
     scenario_settings: ScenarioSettings = None
     seeds: Annotated[
-        str,
-        typer.Option("--seeds", "--episodes", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8."),
+        str, Option("--seeds", "--episodes", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8.")
     ] = "100"
-    reward: Annotated[str, typer.Option(help="paper or training.")] = "paper"
+    reward: Annotated[str, Option(help="paper or training.")] = "paper"
     control_noise_std: NoiseLevel = 0.0
     disturb: Disturb = None
-    agents: Annotated[
-        str, typer.Option(help="An episode for the whole team, or one for each robot: team or robot.")
-    ] = "team"
+    agents: Annotated[str, Option(help="An episode for the whole team, or one for each robot: team or robot.")] = "team"
     only_success: Annotated[
-        bool, typer.Option("--only-success", help="Leave out episodes with a contact or a robot that does not arrive.")
+        bool, Option("--only-success", help="Leave out episodes with a contact or a robot that does not arrive.")
     ] = False
     dataset_id: Annotated[
-        str | None, typer.Option("--id", help="Name in Minari, as d4orm/mine-v0; made of what it holds by default.")
+        str | None, Option("--id", help="Name in Minari, as d4orm/mine-v0; made of what it holds by default.")
     ] = None
-    shard_size: Annotated[int, typer.Option(help="Seeds whose episodes go into one file.")] = 1000
+    shard_size: Annotated[int, Option(help="Seeds whose episodes go into one file.")] = 1000
     workers: Workers = None
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder; by default where Minari finds the name.")] = (
-        None
-    )
+    out: Annotated[Path | None, Option("--out", "-o", help="Folder; by default where Minari finds the name.")] = None
     quiet: Quiet = False
 
     def demonstrations(self) -> Demonstrations:
-        """Return the demonstrations to record."""
         own = parse_settings(self.scenario_settings, "--scenario-set")
         if is_scenario_file(self.scenario):
             reason = f"does not go with a scenario file; change it in {self.scenario}"

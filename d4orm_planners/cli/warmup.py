@@ -40,10 +40,7 @@ _MANOEUVRING = tuple(model for model in COMMON if model in MOVES)
 
 
 def warm_up() -> None:
-    """Run everything once on the smallest problems.
-
-    One compilation of a kernel serves every problem with the same models, so two robots stand for all teams.
-    """
+    """Run everything once on the smallest problems, of two robots: one compilation serves all of the same models."""
     # The last kernel, for three models, takes as long as two others.
     other = compile_ahead.in_another_process(
         f"drive_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_paths(); spread_waves()"

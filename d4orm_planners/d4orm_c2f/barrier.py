@@ -14,20 +14,11 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.envs.joint_state import JointState
 
-NEAR, STOPS = 10 / 3, 2.0
-"""Range of the barriers, in radii of the largest robot plus stops from full speed."""
-
-PARTING = 2.0
-"""Rate at which robots separate where they are too near, per missing distance [1/s]."""
-
-SWEEPS = 400
-"""Most sweeps over all barriers; after so many there hardly are velocities that keep to all."""
-
-EXACT = 1e-6
-"""Largest change that counts as none, as a share of the largest speed limit."""
-
-_STEP = 1 / 150
-"""Step for the direction away from an obstacle, in radii of the largest robot."""
+NEAR, STOPS = 10 / 3, 2.0  #: Range of the barriers, in radii of the largest robot plus stops from full speed
+PARTING = 2.0  #: Rate at which robots separate where they are too near, per missing distance [1/s]
+SWEEPS = 400  #: Most sweeps over all barriers; after so many there hardly are velocities that keep to all
+EXACT = 1e-6  #: Largest change that counts as none, as a share of the largest speed limit
+_STEP = 1 / 150  #: Step for the direction away from an obstacle, in radii of the largest robot
 
 
 def safe_velocities(
@@ -86,7 +77,6 @@ class Barriers(NamedTuple):
 
 
 def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, speed_slack: float) -> Barriers:
-    """Return the barriers for the velocities of robots that are ``free``."""
     d = problem.dimension
     positions = joint.states[:, :d].astype(np.float64)
     radius, wall_radius = (np.asarray(of, np.float64) for of in (problem.team.girth, problem.team.wall_radius))

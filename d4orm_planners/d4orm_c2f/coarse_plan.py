@@ -93,11 +93,8 @@ def rest_of(guidance: CoarsePlan, index: int, factor: int) -> tuple[Problem, Flo
     return left, guidance.controls[step:]
 
 
-LEAST = 5
-"""Least number of waypoints that a subgoal is ahead: nearer ones hardly attract."""
-
-_SHARES = np.linspace(0, 1, 9)[1:]
-"""Shares of the straight line at which its clearance from obstacles is looked at."""
+LEAST = 5  #: Least number of waypoints that a subgoal is ahead: nearer ones hardly attract
+_SHARES = np.linspace(0, 1, 9)[1:]  #: Shares of the straight line at which its clearance from obstacles is looked at
 
 
 def visible_subgoals(
@@ -149,24 +146,15 @@ def _meets_resting(
     return (away <= (width[:, None] + radius) ** 2).any(axis=1)
 
 
-STUCK_WITHIN, STUCK_AFTER = 3, 25
-"""Waypoints that a robot must pass in so many time steps, or else is stuck."""
-BARRED_AFTER = 8
-"""The same number of steps for robots whose paths lead through others at rest for good."""
-WAITING_WITHIN = 1.0
-"""Distance from its present waypoint within which a robot waits, in radii of the largest one."""
-CAREFUL_FOR = 30
-"""Steps for which a robot that was stuck follows its path."""
-CATCHING_UP = 2.0
-"""Share of its lag that a robot makes up for in a second [1/s]."""
+STUCK_WITHIN, STUCK_AFTER = 3, 25  #: Waypoints that a robot must pass in so many time steps, or else is stuck
+BARRED_AFTER = 8  #: The same number of steps for robots whose paths lead through others at rest for good
+WAITING_WITHIN = 1.0  #: Distance from its present waypoint within which a robot waits, in radii of the largest one
+CAREFUL_FOR = 30  #: Steps for which a robot that was stuck follows its path
+CATCHING_UP = 2.0  #: Share of its lag that a robot makes up for in a second [1/s]
 
 
 class StagnationMonitor:
-    """Detects robots that make no progress along their paths.
-
-    Args:
-        joint: Their first state.
-    """
+    """Detects robots that make no progress along their paths, from their first state on."""
 
     def __init__(self, joint: JointState) -> None:
         self._indices = np.zeros(len(joint.goals), int)
@@ -176,10 +164,8 @@ class StagnationMonitor:
     def observe(self, step: int, indices: IntArray, waiting: BoolArray) -> tuple[IntArray, BoolArray]:
         """``(K,)`` steps without progress, and ``(K,)`` robots that are stuck or were so recently.
 
-        Args:
-            step: Time step.
-            indices: ``(K,)`` waypoints that the robots are at; lower ones than before are of another path.
-            waiting: ``(K,)`` robots that are on time, or ahead of the team.
+        At this ``step`` they are at waypoints ``indices`` ``(K,)``, lower ones than before being of another path;
+        those ``waiting`` ``(K,)`` are on time, or ahead.
         """
         moved = (indices >= self._indices + STUCK_WITHIN) | (indices < self._indices) | waiting
         self._indices[moved], self._since[moved] = indices[moved], step
@@ -199,14 +185,9 @@ def keep_time(problem: Problem, joint: JointState, path: FloatArray, indices: In
 
 
 class CoarsePlanning:
-    """Plans for the team of an episode.
+    """Plans for the team of an episode, which ends after ``last_step`` steps, or goes on after arrivals (``None``).
 
-    Args:
-        last_step: Time steps after which the episode ends; ``None`` if it goes on after robots arrive.
-
-    Attributes:
-        planner: Planner of the coarse plans; ``thorough`` is that of teams that are stuck or lost.
-        judged: Whether these must pass ``verify()``, which takes most of the time of cars, in Python, and delays loops.
+    Plans that are not ``judged`` need not pass ``verify()``, which takes most of the time of cars and delays loops.
     """
 
     def __init__(self, config: D4ormC2FConfig, seed: int, last_step: int | None) -> None:
@@ -217,9 +198,7 @@ class CoarsePlanning:
     def warm_start(self, problem: Problem, joint: JointState) -> FloatArray | None:
         """``(H_c, K, m)`` controls of a policy's episode from here, if the coarse plan is to begin with these.
 
-        Raises:
-            ValueError: If there is no such policy, or it cannot drive there.
-            ImportError: If it needs a library that is not installed.
+        ValueError if there is no such policy, or it cannot drive there; ImportError if its library is missing.
         """
         if self._config.warm_start is None:
             return None

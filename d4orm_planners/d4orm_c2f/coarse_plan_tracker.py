@@ -33,31 +33,20 @@ from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.mapf.planner import relay_paths
 from d4orm_planners.tracking.steering import straight_drives
 
-NEARER = 1 / 3
-"""Least progress towards the goals, all robots together, in radii of the largest one."""
+NEARER = 1 / 3  #: Least progress towards the goals, all robots together, in radii of the largest one
 
 
 class CoarsePlanTracker:
-    """Leads a team through an episode.
+    """Leads a team through an episode of ``last_step`` steps, ``lifelong`` if robots that arrive get new goals.
 
-    Args:
-        background: Thread that they are made in, if not between control loops.
-        replanning: Thread that plans anew where loops have a deadline.
-        lifelong: Whether robots that arrive get new goals.
-        last_step: Time steps after which the episode ends.
-
-    Attributes:
-        problem: The problem, with the limits that the robots are believed to have now.
-        guidance: Coarse plan that is followed at present.
-        index: Waypoint at which the team is.
-        rerouted: ``(K,)`` robots with a new path, until :meth:`fresh_start` has given them its controls.
-        stuck: ``(K,)`` robots that make no progress, or made none until recently.
+    Plans are refined in the thread ``background`` and, where loops have a deadline, made anew in ``replanning``. Its
+    ``problem`` has the limits that the robots are believed to have now.
     """
 
-    guidance: CoarseWaypoints
-    index: int
-    rerouted: BoolArray
-    stuck: BoolArray
+    guidance: CoarseWaypoints  #: Coarse plan that is followed at present
+    index: int  #: Waypoint at which the team is
+    rerouted: BoolArray  #: ``(K,)`` robots with a new path, until :meth:`fresh_start` has given them its controls
+    stuck: BoolArray  #: ``(K,)`` robots that make no progress, or made none until recently
 
     def __init__(
         self,

@@ -20,12 +20,9 @@ from d4orm_planners.d4orm_c2f.estimators import (
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.tracking.steering import by_model, limit_controls, present_velocities, short_way_round
 
-MIN_DIFFERENCES = 40
-"""Number of differences needed to estimate how noisy a component is."""
-MIN_NOISE_SHARE = 0.1
-"""Least share of the variance of differences that comes from measurements for these to be filtered."""
-MIN_FILTER_GAIN = 0.1
-"""Least gain of a measurement."""
+MIN_DIFFERENCES = 40  #: Number of differences needed to estimate how noisy a component is
+MIN_NOISE_SHARE = 0.1  #: Least share of measurements in the variance of differences for these to be filtered
+MIN_FILTER_GAIN = 0.1  #: Least gain of a measurement
 
 
 class StateFilter:
@@ -61,11 +58,8 @@ class StateFilter:
     def update(self, measured: FloatArray, led_to: FloatArray, expected: FloatArray, going: BoolArray) -> FloatArray:
         """``(K, n)`` the states; ``measured`` itself as long as nothing tells of noise.
 
-        Args:
-            measured: ``(K, n)`` the states as seen.
-            led_to: ``(K, n)`` what those seen a time step ago lead to.
-            expected: ``(K, n)`` what those estimated a time step ago lead to.
-            going: ``(K,)`` robots that have not arrived.
+        What those seen a step ago have ``led_to``, and what is ``expected`` of those estimated then, are ``(K, n)``;
+        robots ``going`` ``(K,)`` have not arrived.
         """
         seen = np.asarray(measured, np.float64)
         difference = short_way_round(self._problem, seen - led_to)
@@ -88,46 +82,34 @@ class StateFilter:
         return states
 
 
-MAX_INFLATION = 1.0
-"""Largest margin inflation, in radii of the largest robot."""
-REACTION_STEPS = 5
-"""Time steps over which changes of velocity add up before a robot is seen to have reacted."""
-DRIFT_DEADBAND = 0.02
-"""Drift that counts as none, as a share of the largest speed limit."""
-SINGLE_STEP_FACTOR = 1.5
-"""Weight of the largest change of velocity in a single step."""
-MAX_SPEED_SLACK = 0.4
-"""Largest drift that is believed, as a share of the largest speed limit."""
+MAX_INFLATION = 1.0  #: Largest margin inflation, in radii of the largest robot
+REACTION_STEPS = 5  #: Time steps over which changes of velocity add up before a robot is seen to have reacted
+DRIFT_DEADBAND = 0.02  #: Drift that counts as none, as a share of the largest speed limit
+SINGLE_STEP_FACTOR = 1.5  #: Weight of the largest change of velocity in a single step
+MAX_SPEED_SLACK = 0.4  #: Largest drift that is believed, as a share of the largest speed limit
 
 
 class Deviation:
-    """Compares an episode with the model.
+    """Compares an episode with the model, and estimates what the settings say; ``docks`` if robots stay at their goals.
 
-    Args:
-        config: The settings, which say what is estimated.
-        docks: Whether robots stay at their goals, rather than drive through them to others.
-
-    Attributes:
-        speed: ``(K,)`` the largest recent deviation of each robot in a time step, over its length [m/s].
-        drift: The largest recent change of a robot's velocity from the expected one within a few steps [m/s].
-        problem: The robots with the limits that they are believed to have now.
-        latency: Estimator of the latency of commands.
-        packet_loss: Estimator of lost commands, or ``None``.
-        stall: Estimator of stalled robots, or ``None``.
+    Its ``problem`` has the limits that the robots are believed to have now, its ``drift`` is the largest recent change
+    of a robot's velocity from the expected one within a few steps [m/s].
     """
 
     def __init__(self, problem: Problem, engine: Engine, config: D4ormC2FConfig, docks: bool) -> None:
         self.problem = self._first = problem
         self._engine, self._docks = engine, docks
-        self.latency = LatencyEstimator(problem.team, config.delay)
+        self.latency = LatencyEstimator(problem.team, config.delay)  #: Estimator of the latency of commands
+        #: Estimator of lost commands, or ``None``
         self.packet_loss = PacketLossEstimator(problem) if config.expect_losses else None
         self._gain = ActuatorGainEstimator(problem) if config.learn_limits else None
-        self.stall = StallEstimator(problem) if config.stalls else None
+        self.stall = StallEstimator(problem) if config.stalls else None  #: Estimator of stalled robots, or ``None``
         self._filter = StateFilter(problem) if config.filter_states else None
         self._measured: JointState | None = None
         self._estimated: JointState | None = None
         self._expected: tuple[FloatArray, FloatArray] | None = None
         self._changes = np.zeros((REACTION_STEPS, problem.num_robots, problem.dimension), np.float32)
+        #: ``(K,)`` the largest recent deviation of each robot in a time step, over its length [m/s]
         self.speed = np.zeros(problem.num_robots)
         self._first_order = np.array([model.first_order for model in problem.team.robot_models])
         self.drift, self._speed = 0.0, float(problem.team.max_speed.max())

@@ -13,17 +13,10 @@ from d4orm_env.engine.types import Engine
 from d4orm_planners.tracking.goal_drives import drive_to_goal
 from d4orm_planners.tracking.steering import NEAR_VIA, at_rest, drives, straight_drives
 
-PASSING = 1 / 75_000
-"""Share of the goal radius that is the arrival radius of robots that drive through their goals."""
-
-NEARBY = 3.0
-"""Distance from its goal within which a robot that cannot turn in place looks for a manoeuvre, in turning radii."""
-
-DIRECTIONS, BEYOND = 16, (0.25, 1.0, 2.0)
-"""Number of first directions of manoeuvres, and their distances, in turning radii."""
-
-LENGTH, RESERVE = 8.0, 2.0
-"""Largest length of a manoeuvre, in turning radii, and its longest time beyond that at full speed [s]."""
+PASSING = 1 / 75_000  #: Share of the goal radius that is the arrival radius of robots that drive through their goals
+NEARBY = 3.0  #: Distance from its goal within which a robot that turns only as it drives manoeuvres, in turning radii
+DIRECTIONS, BEYOND = 16, (0.25, 1.0, 2.0)  #: Manoeuvres' first directions, and their distances in turning radii
+LENGTH, RESERVE = 8.0, 2.0  #: Largest length of a manoeuvre, in turning radii, and its longest time beyond that [s]
 
 
 def arrival_radius(problem: Problem, docks: bool) -> float:

@@ -13,26 +13,16 @@ from d4orm_env.dynamics.robot_model import ACCELERATION
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.tracking.steering import by_model, present_velocities, track_velocities, weaker
 
-AT_LIMIT = 0.95
-"""Share of its limits from which on a command asks a robot for all that it can do."""
-MIN_FULL_COMMANDS = 5
-"""Number of such commands before a robot may be believed to be weak."""
-FULL_GAIN = 0.97
-"""Gain from which on a robot counts as strong as its limits say."""
-MIN_GAIN = 0.3
-"""Lowest gain that is believed."""
-FORGETTING_RATE = 0.1
-"""Share that the mean of the disturbances of commands forgets in a time step, after the first steps."""
-PRIOR_STEPS = 4
-"""Number of steps without a disturbance that the mean begins with."""
-SIGNIFICANCE = 3.0
-"""Number of standard errors up to which that mean may be noise."""
-MAX_CORRELATION = 0.9
-"""Largest correlation of one disturbance of commands with the one before that is believed."""
-NO_VARIANCE = 1e-12
-"""Variance, in shares of the limits, below which there is none."""
-GAIN_STEP = 0.05
-"""Resolution of the shares of the limits that are kept back."""
+AT_LIMIT = 0.95  #: Share of its limits from which on a command asks a robot for all that it can do
+MIN_FULL_COMMANDS = 5  #: Number of such commands before a robot may be believed to be weak
+FULL_GAIN = 0.97  #: Gain from which on a robot counts as strong as its limits say
+MIN_GAIN = 0.3  #: Lowest gain that is believed
+FORGETTING_RATE = 0.1  #: Share that the mean of the disturbances of commands forgets in a time step, later on
+PRIOR_STEPS = 4  #: Number of steps without a disturbance that the mean begins with
+SIGNIFICANCE = 3.0  #: Number of standard errors up to which that mean may be noise
+MAX_CORRELATION = 0.9  #: Largest correlation of one disturbance of commands with the one before that is believed
+NO_VARIANCE = 1e-12  #: Variance, in shares of the limits, below which there is none
+GAIN_STEP = 0.05  #: Resolution of the shares of the limits that are kept back
 
 
 def shares_of_limits(problem: Problem, controls: FloatArray | Floats) -> Floats:
@@ -66,20 +56,16 @@ class ActuatorGainEstimator:
     predictive control (Chisci, Rossiter, Zappa, Systems with persistent disturbances: predictive control with
     restricted constraints, Automatica 37, 2001). Noise comes to nothing on average: a mean that may be chance is not
     kept back, and one of noise that lasts may be chance for longer.
-
-    Attributes:
-        problem: The robots with the limits that are believed now.
-        added: ``(K, m)`` what is added to commands for some time; zero where it may be chance.
     """
 
     def __init__(self, problem: Problem) -> None:
-        self._first = self.problem = problem
+        self._first = self.problem = problem  #: The robots with the limits that are believed now
         shape = problem.num_robots, problem.control_size
         self._most, self._asked = np.zeros(shape), np.zeros(shape, int)
         self._share = self._control_share = np.ones(shape)
         self._seen, (self._added, self._apart) = np.zeros(problem.num_robots), np.zeros((2, *shape))
         self._variance, self._covariance = np.zeros((2, problem.num_robots))
-        self.added = np.zeros(shape, np.float32)
+        self.added = np.zeros(shape, np.float32)  #: ``(K, m)`` lasting additions to commands; zero if by chance
 
     def observe(self, commanded: FloatArray, executed: FloatArray, going: BoolArray) -> None:
         """Compare commands ``(K, m)`` with what those ``going`` ``(K,)`` executed of them."""
@@ -118,29 +104,18 @@ class ActuatorGainEstimator:
         self.added = np.where(significant[:, None], self._added, 0.0).astype(np.float32)
 
 
-MAX_LATENCY = 10
-"""Largest latency that is recognised [steps]."""
-DECAY = 0.98
-"""Share of a difference that is left after a time step."""
-CONFIDENCE = 0.5
-"""A latency is believed once its commands differ from those executed by less than this share of the present one's."""
+MAX_LATENCY = 10  #: Largest latency that is recognised [steps]
+DECAY = 0.98  #: Share of a difference that is left after a time step
+CONFIDENCE = 0.5  #: A latency is believed once its commands miss what was executed by this share of the present one's
 
 
 class LatencyEstimator:
-    """Estimates the latency of commands by comparing those sent with those executed.
-
-    Args:
-        team: Robots that are sent commands.
-        known: The latency [steps], or ``None`` to estimate it.
-
-    Attributes:
-        steps: The latency [steps].
-    """
+    """Estimates the latency of commands by comparing those sent with those executed, unless it is ``known`` [steps]."""
 
     def __init__(self, team: Team, known: int | None) -> None:
         self._units = team.control_units
         self._known = known is not None
-        self.steps = known or 0
+        self.steps = known or 0  #: The latency [steps]
         # Before the first there were none, which is as if they were zero.
         self._sent = [np.zeros_like(self._units)] * (max(MAX_LATENCY, self.steps) + 1)
         self._apart = np.zeros(MAX_LATENCY + 1)
@@ -171,27 +146,19 @@ class LatencyEstimator:
         return self._sent[-1 - self.steps]
 
 
-MIN_CHANGE = 0.3
-"""Least distance of a command that counts from what was executed last, as a share of a robot's limits."""
-PRIOR_COMMANDS = 5
-"""Number of commands taken to have arrived before the first."""
-NEGLIGIBLE = 1e-4
-"""Probability of a run of losses up to which it is neglected."""
-MAX_RUN = 10
-"""Longest run of losses that is expected."""
+MIN_CHANGE = 0.3  #: Least distance of a command that counts from what was executed last, in shares of a robot's limits
+PRIOR_COMMANDS = 5  #: Number of commands taken to have arrived before the first
+NEGLIGIBLE = 1e-4  #: Probability of a run of losses up to which it is neglected
+MAX_RUN = 10  #: Longest run of losses that is expected
 
 
 class PacketLossEstimator:
-    """Detects robots that repeat the command before instead of a new one, and estimates how often that happens.
-
-    Attributes:
-        run: Number of commands that may get lost in a row.
-    """
+    """Detects robots that repeat the command before instead of a new one, and estimates how often that happens."""
 
     def __init__(self, problem: Problem) -> None:
         self._problem, self._last = problem, np.zeros((problem.num_robots, problem.control_size), np.float32)
         self._sent, self._lost = PRIOR_COMMANDS, 0
-        self.run = 0
+        self.run = 0  #: Number of commands that may get lost in a row
 
     def observe(self, commanded: FloatArray, executed: FloatArray, going: BoolArray) -> BoolArray:
         """``(K,)`` robots that go on with the command before, or stay at rest, whatever they were told.
@@ -212,31 +179,22 @@ class PacketLossEstimator:
         return lost
 
 
-IDLE_STEPS = 8
-"""Steps in a row without a response to commands after which a robot has stalled."""
-BRAKING_STEPS = 3
-"""Steps in a row of braking as hard as it can against its commands after which it has stalled."""
-MIN_BRAKING = 0.5
-"""Least braking that counts, and least distance of the command from it, as shares of the robot's limits."""
+IDLE_STEPS = 8  #: Steps in a row without a response to commands after which a robot has stalled
+BRAKING_STEPS = 3  #: Steps in a row of braking as hard as it can against its commands after which it has stalled
+MIN_BRAKING = 0.5  #: Least braking that counts, and least distance of the command from it, in shares of the limits
 MIN_COMMAND, MIN_RESPONSE = 0.2, 0.1
 """Least command that counts, as a share of a robot's limits, and least response to it, as a share of the command."""
-RECOVERED = 2 / 3
-"""Distance from where it stalled at which a robot moves again, in radii of the largest robot."""
-PROBE = 0.1
-"""Command of a stalled robot, as a share of its limits, which shows when it obeys again."""
+RECOVERED = 2 / 3  #: Distance from where it stalled at which a robot moves again, in radii of the largest robot
+PROBE = 0.1  #: Command of a stalled robot, as a share of its limits, which shows when it obeys again
 
 
 class StallEstimator:
-    """Detects robots that brake or stay at rest whatever they are commanded.
-
-    Attributes:
-        robots: ``(K,)`` stalled robots.
-    """
+    """Detects robots that brake or stay at rest whatever they are commanded."""
 
     def __init__(self, problem: Problem) -> None:
         self._problem, self._d = problem, problem.dimension
         self._idle, self._braking = np.zeros((2, problem.num_robots), int)
-        self.robots: BoolArray = np.zeros(problem.num_robots, bool)
+        self.robots: BoolArray = np.zeros(problem.num_robots, bool)  #: ``(K,)`` stalled robots
         self._positions = np.zeros((problem.num_robots, self._d), np.float32)
         self._brakes: FloatArray = np.zeros((problem.num_robots, problem.control_size), np.float32)
 

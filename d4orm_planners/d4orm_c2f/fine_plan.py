@@ -16,10 +16,8 @@ from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingEngine, SamplingRules, SamplingTask
 from d4orm_planners.tracking.tracker import follow_reference
 
-SHORTER = 3
-"""Divisor of the fresh steps that a robot takes before it stops if it would violate the margin otherwise."""
-NEAREST = 256
-"""Pairs among which the least gap is looked for at first."""
+SHORTER = 3  #: Divisor of the fresh steps that a robot takes before it stops if it would violate the margin otherwise
+NEAREST = 256  #: Pairs among which the least gap is looked for at first
 FEWER, IN_TIME = (1, 2, 4), 0.8
 """Divisors of the denoising steps where a deadline leaves no time for all, and the share of it that is used."""
 
@@ -47,13 +45,9 @@ class Situation(NamedTuple):
 
 
 class Window:
-    """Plans finely over the prediction horizon, from wherever the robots are.
+    """Plans finely over the prediction horizon, from wherever the robots are; ``docks`` if they stay at their goals.
 
-    Args:
-        docks: Whether robots stay at their goals, rather than drive through them to others.
-
-    Attributes:
-        problem: The problem, with the limits that the robots are believed to have now.
+    Its ``problem`` has the limits that the robots are believed to have now.
     """
 
     def __init__(self, problem: Problem, config: D4ormC2FConfig, engine: SamplingEngine, docks: bool) -> None:

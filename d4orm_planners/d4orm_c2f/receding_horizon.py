@@ -6,9 +6,10 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+from pettingzoo import ParallelEnv
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed, generator
@@ -28,17 +29,9 @@ from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.goal_drives import drive_to_goal
 from d4orm_planners.tracking.steering import present_velocities, track_velocities
 
-if TYPE_CHECKING:
-    from pettingzoo import ParallelEnv
-
-GAP = 0.4
-"""Share of the margin that is kept in the last resort."""
-
-REMEMBERED = 10_000
-"""Control loops; an episode with ever new goals has no end."""
-
-NEARLY = 1e-3
-"""Share of its speed limit by no more than which two velocities of a robot differ that are the same."""
+GAP = 0.4  #: Share of the margin that is kept in the last resort
+REMEMBERED = 10_000  #: Control loops; an episode with ever new goals has no end
+NEARLY = 1e-3  #: Share of its speed limit by no more than which two velocities of a robot differ that are the same
 
 
 @dataclass(frozen=True)
@@ -48,8 +41,7 @@ class LoopRecord:
     step: int  #: The environment's step at which it began
     wall_time: float  #: Time used [s]
     subgoal_index: int  #: Waypoint of the guidance that the team headed for
-    #: Least gap between the surfaces of any two robots over the prediction [m]; infinite for one robot
-    predicted_margin: float
+    predicted_margin: float  #: Least gap between two robots' surfaces over the prediction [m]; infinite for one robot
     missed: bool  #: Whether it took longer than the deadline, so that the last plan went on
     replanned: bool  #: Whether the guidance was planned anew
     refined: bool  #: Whether a refined guidance was taken over
@@ -57,22 +49,14 @@ class LoopRecord:
 
 
 class D4ormC2F(StatePolicy):
-    """Follows a coarse plan of the whole team by short fine plans from wherever the robots are, loop by loop.
-
-    Attributes:
-        config: The settings.
-        loops: A :class:`LoopRecord` per control loop of the present episode, of the last :data:`REMEMBERED`.
-        coarse_time: Time that the first coarse plan took [s].
-        subgoals: ``(K, d)`` subgoals of the last control loop [m]; the start before the first.
-        predicted: ``(1 + T, K, d)`` path of its plan, without braking and evading in the last resort [m].
-    """
+    """Follows a coarse plan of the whole team by short fine plans from wherever the robots are, loop by loop."""
 
     name = "d4orm-c2f"
     config_class: ClassVar[type[CheckedSettings] | None] = D4ormC2FConfig
     presets: ClassVar = {"paper": PAPER_CONTROL}
 
     def __init__(self, config: D4ormC2FConfig | None = None) -> None:
-        self.config = config or D4ormC2FConfig()
+        self.config = config or D4ormC2FConfig()  #: The settings
         if self.config.warm_start is not None:
             find_policy(self.config.warm_start)
         self._engine = get_sampling_engine(self.config.engine)
@@ -96,7 +80,7 @@ class D4ormC2F(StatePolicy):
         self._refinement.forget()
         self._replanning.forget()
         self._control.forget()
-        self.loops: deque[LoopRecord] = deque(maxlen=REMEMBERED)
+        self.loops: deque[LoopRecord] = deque(maxlen=REMEMBERED)  #: Of the control loops of the present episode
         self._begun = 0
         joint = split_state(self.problem, env.state())
         lifelong = env.unwrapped.lifelong
@@ -104,7 +88,9 @@ class D4ormC2F(StatePolicy):
         self._window.prepare(joint)
         prepare_barriers()
         self._plan, self._next = self._window.no_controls(), 0
+        #: ``(K, d)`` subgoals of the last control loop [m]; the start before the first
         self.subgoals: FloatArray = joint.states[:, : self.problem.dimension]
+        #: ``(1 + T, K, d)`` path of its plan, without braking and evading in the last resort [m]
         self.predicted: FloatArray = self.subgoals[None]
         self._reached = np.full_like(joint.goals, np.nan)
         self._note_arrivals(joint)
@@ -115,7 +101,7 @@ class D4ormC2F(StatePolicy):
         )
         self._tracker.begin(joint, self._arrived)
         self._deviation = Deviation(self.problem, self._engine, self.config, docks=not lifelong)
-        self.coarse_time = time.perf_counter() - begin
+        self.coarse_time = time.perf_counter() - begin  #: Time that the first coarse plan took [s]
 
     def _controls(self, joint: JointState) -> FloatArray:
         goals = joint.goals

@@ -39,11 +39,7 @@ PAPER_CONTROL = {
 
 @dataclass(frozen=True, kw_only=True)
 class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
-    """Settings of D4orm-C2F; those of the softmax and of the diffusion schedule are a control loop's.
-
-    Raises:
-        ValueError: If a value makes no sense; the message names it.
-    """
+    """Settings of D4orm-C2F; those of the softmax and of the diffusion schedule are a control loop's."""
 
     engine: EngineName = "auto"  #: ``"auto"``, ``"cpu"`` or ``"jax"``
     coarse_factor: Steps = 2  #: ``f``, fine time steps per coarse one
@@ -67,8 +63,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     #: Whether the team is where all robots are on average, as in the paper, not those under way: robots that have
     #: arrived then hold the subgoals of others back
     mean_of_all: bool = False
-    #: Whether a subgoal behind robots at rest is replaced by the furthest visible one before it
-    line_of_sight: bool = True
+    line_of_sight: bool = True  #: A subgoal behind robots at rest is replaced by the furthest visible one before it
     num_samples: Samples = 128  #: ``M`` of a control loop
     num_steps: Steps = 20  #: ``N`` of a control loop
     #: ``"robot"`` or ``"team"``: whose reward weights the samples of a control loop

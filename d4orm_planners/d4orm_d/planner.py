@@ -1,7 +1,7 @@
 """D4orm-D: failure-aware decoupling for big teams (paper, section V, Algorithm 3).
 
 Robots that fail are replanned as the paper or its authors' code does (:mod:`~d4orm_planners.d4orm_d.decoupling`); by
-default they are repaired independently (:mod:`~d4orm_planners.d4orm_d.repairs`).
+default they are repaired independently (:mod:`~d4orm_planners.d4orm_d.decoupling`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from d4orm_planners.base.candidate import team_conflicts
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.settings import CheckedSettings, Count, NotNegative, Positive, Samples, Steps, one_of
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d4orm_d.decoupling import GroupRuns, JointRun
-from d4orm_planners.d4orm_d.repairs import DeformedPlan, Repairs
+from d4orm_planners.d4orm_d.decoupling import DeformedPlan, GroupRuns, JointRun, Repairs
 from d4orm_planners.engine.sampling_types import SamplingTask
 from d4orm_planners.sampling.d4orm import AUTHORS_DEFORMATION, PAPER_DEFORMATION, DeformationConfig, DeformingPlanner
 from d4orm_planners.sampling.settings import Credit
@@ -64,11 +63,9 @@ class D4ormDConfig(JointRunSettings, DeformationConfig):
     #: robots so meet less than half of the others on average.
     start: Start = "auto"
     first_collisions: bool = True  #: Whether an iteration that starts from zero controls penalises collisions
-    #: ``M`` of an independent repair. A few may be better than many: their error is a search of its own.
-    repair_samples: Samples = 128
+    repair_samples: Samples = 128  #: ``M`` of an independent repair. Few may be better: their error is a search
     repair_steps: Steps = 50  #: ``N`` of an independent repair
-    #: The same in an independent repair. At 1 it can be cheaper to brush past a robot than to wait.
-    repair_penalty: Positive = 3.0
+    repair_penalty: Positive = 3.0  #: The same in an independent repair. At 1 brushing past can be cheaper than waiting
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,8 +86,7 @@ class D4ormDConfig(JointRunSettings, DeformationConfig):
             )
 
 
-State = GroupRuns | JointRun | Repairs
-"""State between iterations, by the kind of decoupling."""
+State = GroupRuns | JointRun | Repairs  #: State between iterations, by the kind of decoupling
 
 
 class D4ormD(DeformingPlanner):
@@ -162,7 +158,6 @@ class D4ormD(DeformingPlanner):
         return state.improve(team), replace(iteration, controls=team.controls)
 
     def is_big(self, problem: Problem) -> bool:
-        """Check whether the team is a big one."""
         return self.config.big_team is not None and problem.num_robots > self.config.big_team
 
     def num_samples(self, search: SolveRun) -> int:

@@ -24,8 +24,7 @@ from d4orm_planners.d_d4orm.transport import KINDS, Message, MessageError, Trans
 from d4orm_planners.engine.sampling_types import SamplingEngine
 
 logger = logging.getLogger(__name__)
-TOLERANCE = 1e-3
-"""Rewards that differ by more than this are not the same; engines round differently."""
+TOLERANCE = 1e-3  #: Rewards that differ by more than this are not the same; engines round differently
 
 
 class Stopped(Exception):
@@ -33,19 +32,11 @@ class Stopped(Exception):
 
 
 class Evaluator:
-    """Evaluates candidates, and remembers some.
-
-    Args:
-        remembered: Candidates of this process's own nodes that are remembered.
-
-    Attributes:
-        stop: Once set, nodes leave their iterations between denoising steps.
-        solution_ends: Whether to set it at the first solution.
-    """
+    """Evaluates candidates, and remembers so many of this process's own nodes."""
 
     def __init__(self, engine: SamplingEngine, problem: Problem, remembered: int = 0) -> None:
-        self.stop = threading.Event()
-        self.solution_ends = False
+        self.stop = threading.Event()  #: Once set, nodes leave their iterations between denoising steps
+        self.solution_ends = False  #: Whether the first solution sets :attr:`stop`
         self.engine, self.problem, self._remembered = engine, problem, remembered
         self._known: dict[bytes, Candidate] = {}
         self._lock = threading.Lock()
@@ -81,16 +72,7 @@ class Report:
 class Inbox:
     """Takes messages from a transport; nothing that arrives makes it raise.
 
-    Args:
-        own: The node that it belongs to, or ``None`` for an observer's.
-        heard: Nodes whose messages reach it; ``None`` for all.
-
-    Attributes:
-        newest: The newest report of every node heard from, by node.
-        dropped: Numbers of messages that were dropped, by :data:`~d4orm_planners.d_d4orm.transport.KINDS`.
-        false_claims: Candidates that were not what their sender claimed. They count for what they are.
-        namesake: The number of the last candidate that another node sent under this one's own number, or ``None``.
-        waited: Seconds spent so far waiting for messages.
+    It is that of the node ``own``, or an observer's, and takes messages of the nodes ``heard``, by default of all.
     """
 
     def __init__(
@@ -105,12 +87,13 @@ class Inbox:
         self._num_nodes, self._own, self._heard = num_nodes, own, heard
         self._owner = "the observer" if own is None else f"node {own}"
         self._logged: set[str] = set()
-        self.newest: dict[int, Report] = {}
+        self.newest: dict[int, Report] = {}  #: The newest report of every node heard from, by node
         # All kinds from the beginning: other threads look at it, which a growing dictionary does not bear.
+        #: Numbers of messages that were dropped, by :data:`~d4orm_planners.d_d4orm.transport.KINDS`
         self.dropped: Counter[str] = Counter(dict.fromkeys(KINDS, 0))
-        self.false_claims = 0
-        self.namesake: int | None = None
-        self.waited = 0.0
+        self.false_claims = 0  #: Candidates that were not what their sender claimed. They count for what they are
+        self.namesake: int | None = None  #: Last number that another node sent under this one's, or ``None``
+        self.waited = 0.0  #: Seconds spent so far waiting for messages
 
     def receive(self, timeout: float = 0.0) -> list[Report]:
         """The new reports among what has arrived, by node; waits up to ``timeout`` [s] if nothing has."""
@@ -164,13 +147,9 @@ class Inbox:
             logger.warning("%s received a message with a fault (%s): %s", self._owner, kind, text)
 
 
-Item: TypeAlias = Report | Message
-"""Candidate of a node, evaluated or as it was sent."""
-
+Item: TypeAlias = Report | Message  #: Candidate of a node, evaluated or as it was sent
 SELECTIONS = ("top-k", "max", "k-means")
-
-ROUNDS = 50
-"""Rounds after which k-means stops, converged or not."""
+ROUNDS = 50  #: Rounds after which k-means stops, converged or not
 
 
 def shares(total: int, parts: int) -> tuple[int, ...]:

@@ -21,17 +21,10 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d_d4orm.inbox import Evaluator, Inbox, Stopped, choose
 from d4orm_planners.d_d4orm.transport import Message, Transport, encode
 
-KINDS = ("computed", "sent", "received", "selected")
-"""A node has made a candidate, sent it, got one, or chosen it to go on from."""
-
-ROUNDING = 1e-5
-"""Difference of rewards of one candidate that is clipped and evaluated again; two are hardly ever as near."""
-
-RESEND = 0.2
-"""Seconds after which a candidate is sent again, as messages may get lost."""
-
-LAST_WAIT = 30.0
-"""Seconds that the end of the process waits for an abandoned thread: native code must not be interrupted."""
+KINDS = ("computed", "sent", "received", "selected")  #: A node made a candidate, sent it, got one, or chose it
+ROUNDING = 1e-5  #: Difference of rewards of one candidate that is clipped and evaluated anew; two are hardly as near
+RESEND = 0.2  #: Seconds after which a candidate is sent again, as messages may get lost
+LAST_WAIT = 30.0  #: Seconds that the process's end waits for an abandoned thread: native code must not be interrupted
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,14 +76,6 @@ class Node:
         sequence: The number before that of its first message; more than any that it sent before, if it did, and on a
             network the time at which it began, by which two nodes of one number know which was first.
         observer: Called with every :class:`~d4orm_planners.d_d4orm.node.Event`, in the node's own thread.
-
-    Attributes:
-        search: Its own search.
-        candidate: The candidate that it made last.
-        inbox: Messages of the others.
-        messages: Messages sent so far; each goes to all other nodes.
-        message_bytes: Their length together.
-        excluded: Samples left out so far because their reward was not finite.
     """
 
     def __init__(
@@ -105,14 +90,15 @@ class Node:
     ) -> None:
         self.number = number
         seed = node_seed(task.seed, number)
+        #: Its own search
         self.search = SolveRun(planner, evaluator.problem, seed, task.controls, evaluator.engine, evaluator.own)
         self.search.cancelled = evaluator.stop
-        self.candidate = self.search.current
-        self.messages = self.message_bytes = 0
+        self.candidate = self.search.current  #: The candidate that it made last
+        self.messages = self.message_bytes = 0  #: Sent so far, each to all other nodes, and their length together
         self._transport = transport
         self._others = task.heard_by(number)
-        self.inbox = Inbox(evaluator, transport, task.num_nodes, number, self._others)
-        self.excluded = 0
+        self.inbox = Inbox(evaluator, transport, task.num_nodes, number, self._others)  #: Messages of the others
+        self.excluded = 0  #: Samples left out so far because their reward was not finite
         self._task = task
         self._sequence = self._began = sequence
         self._observer = observer
@@ -134,8 +120,7 @@ class Node:
     def step(self, stop: threading.Event, timeout: float, improve: bool) -> bool:
         """Refine and exchange at its own pace, waiting for the others no longer than ``timeout`` [s].
 
-        Returns:
-            Whether to go on: not if asked to stop, nor with a solution unless it is to be improved.
+        True to go on: not if asked to stop, nor with a solution unless it is to be improved.
         """
         self.refine()
         if stop.is_set() or self.search.time_left == 0 or (self.search.best.solved and not improve):
@@ -147,10 +132,7 @@ class Node:
         return True
 
     def check_number(self) -> None:
-        """Raise ``ValueError`` if another node has this one's number, and had it first, or says so.
-
-        A solution is not lost to that.
-        """
+        """ValueError if another node has this one's number, and had it first, or says so; not with a solution."""
         namesake = self.inbox.namesake
         if namesake is not None and namesake <= self._began and not self.search.best.solved:
             last = self._task.num_nodes - 1
@@ -261,10 +243,7 @@ class ThreadJob:
         self._thread = threading.Thread(target=self._run, daemon=True, name=f"d-d4orm-{node.number}")
 
     def start(self) -> None:
-        """Begin.
-
-        Ctrl-C may come while the thread starts, so the pool must know of this job before.
-        """
+        """Begin. Ctrl-C may come while the thread starts, so the pool must know of this job before."""
         self._begin = time.perf_counter()
         self._thread.start()
 

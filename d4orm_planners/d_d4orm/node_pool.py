@@ -20,26 +20,19 @@ from d4orm_planners.d_d4orm.transport import Transport
 logger = logging.getLogger(__name__)
 
 MODES = ("sync", "async")
-
-GLANCE = 0.05
-"""Seconds between looks at whether the nodes still live, while nothing arrives."""
+GLANCE = 0.05  #: Seconds between looks at whether the nodes still live, while nothing arrives
 
 
 class NodePool(ABC):
-    """The nodes of one solve.
+    """The nodes of one solve, with all ends of transports to close.
 
-    Args:
-        transports: All ends to close in the end.
-        timeout: Seconds that are waited for stragglers: beyond the time limit, and when asynchronous in every round.
-
-    Attributes:
-        alive: Nodes that have not failed.
+    Stragglers have ``timeout`` seconds: beyond the time limit, and when asynchronous in every round.
     """
 
     def __init__(
         self, nodes: Sequence[Node], transports: Sequence[Transport], timeout: float, evaluator: Evaluator
     ) -> None:
-        self.alive = list(nodes)
+        self.alive = list(nodes)  #: Nodes that have not failed
         self.timeout = timeout
         self._evaluator = evaluator
         self._nodes = tuple(nodes)
@@ -79,10 +72,7 @@ class NodePool(ABC):
         return self._iteration(best)
 
     def close(self) -> Candidate:
-        """Stop the nodes, and return the best candidate that they have seen.
-
-        Threads are waited for no longer than the timeout.
-        """
+        """Stop the nodes, and return the best candidate seen; threads are waited for no longer than the timeout."""
         self._evaluator.stop.set()
         for node in self._nodes:
             node.close()
@@ -105,9 +95,7 @@ class NodePool(ABC):
 
     @abstractmethod
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
-        """New candidates of the nodes, which go on once there is a solution to ``improve`` it; time left is below 0
-        when overdue.
-        """
+        """New candidates of the nodes, which go on to ``improve`` a solution; time left is below 0 when overdue."""
 
     def _lose(self, job: ThreadJob, reason: str) -> None:
         self.alive.remove(job.node)

@@ -37,8 +37,7 @@ NodePlanner: TypeAlias = D4orm | D4ormD | Hybrid
 NODE_PLANNERS: Mapping[str, type[NodePlanner]] = MappingProxyType({k.name: k for k in (D4orm, D4ormD, Hybrid)})
 """The planners that a node can run."""
 
-MOST_NODES = 1024
-"""Each is a thread or a process with a candidate of its own."""
+MOST_NODES = 1024  #: Each is a thread or a process with a candidate of its own
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,8 +70,7 @@ class DD4ormConfig(PlannerConfig):
     #: ``"local"``: nodes are threads of this process. ``"ray"``: their iterations run in actors of Ray. ``"zenoh"``:
     #: this process is one node among others on a network, each at its own pace (``mode="async"``).
     transport: Annotated[str, one_of(TRANSPORTS)] = "local"
-    #: Number of this process among the nodes, from 0; over a network only
-    node: Annotated[Whole, Field(ge=0)] | None = None
+    node: Annotated[Whole, Field(ge=0)] | None = None  #: Number of this process among the nodes, from 0; networks only
     #: Network of the nodes: :class:`~d4orm_planners.d_d4orm.zenoh_transport.ZenohSettings`, or a mapping of them; over
     #: a network only
     zenoh: Annotated[ZenohSettings | None, SkipValidation] = None  # checked once it is known to be of use

@@ -25,16 +25,11 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d_d4orm.transport import Message, decode, encode
 from d4orm_planners.engine.sampling_types import get_sampling_engine
 
-TIMEOUT = 10.0
-"""Seconds to wait for the head of a cluster to answer."""
-
+TIMEOUT = 10.0  #: Seconds to wait for the head of a cluster to answer
 LOOPBACK = ("127.0.0.1", "::1")
-RESTARTS = 3
-"""Number of times that a lost actor is started again, before its node is done without."""
-START = 120.0
-"""Seconds that actors may take to start and to compile."""
-GLANCE = 0.1
-"""Seconds between looks at whether an iteration under way is still wanted."""
+RESTARTS = 3  #: Number of times that a lost actor is started again, before its node is done without
+START = 120.0  #: Seconds that actors may take to start and to compile
+GLANCE = 0.1  #: Seconds between looks at whether an iteration under way is still wanted
 
 
 def import_ray(what: str) -> ModuleType:
@@ -130,13 +125,9 @@ class Worker:
         return os.getpid()
 
     def advance(self, iteration: int, data: bytes, time_left: float | None) -> ActorOutcome:
-        """One iteration.
+        """One iteration from a candidate, a message, in the time left [s], compilation not counted; ``None`` for any.
 
-        Args:
-            iteration: Those done so far. It is all that a worker must know of the past, so that a new one can take the
-                place of one that was lost.
-            data: The candidate to go on from, a message.
-            time_left: Seconds that it may take, compilation not counted, or ``None``.
+        Iterations done are all that a worker must know of the past: a new one can take a lost one's place.
         """
         search = self._search
         search.time_limit = None if time_left is None else search.watch.elapsed + time_left
@@ -156,15 +147,11 @@ class Worker:
 
 
 class RayPlanner(Planner):
-    """A planner whose iterations run in an actor.
-
-    Attributes:
-        process: Number of the actor's process.
-    """
+    """A planner whose iterations run in an actor."""
 
     def __init__(self, planner: Planner, node: int, num_nodes: int, ray: ModuleType, actor: Any) -> None:
         super().__init__(planner.config)
-        self.process = 0
+        self.process = 0  #: Number of the actor's process
         self._node, self._num_nodes = node, num_nodes
         self._ray, self._actor = ray, actor
         self._calling, self._closed = threading.Lock(), threading.Event()
@@ -237,7 +224,6 @@ def ray_planners(
 
 
 def _message(node: int, search: SolveRun) -> bytes:
-    """The search's current candidate."""
     candidate = search.current
     message = Message(node, search.iteration, candidate.planned, candidate.reward, bool(candidate.solved))
     return encode(message, search.problem)

@@ -22,8 +22,7 @@ from d4orm_planners.base.candidate import MOST_OF_LIMIT
 
 MAGIC = b"D4DC"
 VERSION = 1
-MAX_BYTES = 16 * 2**20
-"""Longer messages are neither sent nor read."""
+MAX_BYTES = 16 * 2**20  #: Longer messages are neither sent nor read
 
 KINDS = (
     "garbage", "truncated", "too_large", "version", "checksum", "problem", "node", "shape", "not_finite", "limits",
@@ -115,9 +114,7 @@ def _checked(controls: FloatArray, shape: tuple[int, ...], reward: float, proble
 
 
 TRANSPORTS = ("local", "ray", "zenoh")
-
-WAITING = 64
-"""Messages that wait for a slow node at most; then the oldest are lost, which newer ones replace anyhow."""
+WAITING = 64  #: Messages that wait for a slow node at most; then the oldest are lost, which newer ones replace anyhow
 
 
 class Transport(Protocol):
@@ -148,13 +145,11 @@ class Mailbox:
         self.closed = False
 
     def put(self, data: bytes) -> None:
-        """Add a message."""
         with self._changed:
             self._arrived.append(data)
             self._changed.notify_all()
 
     def collect(self, timeout: float = 0.0) -> list[bytes]:
-        """See :meth:`Transport.collect`."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._arrived, timeout)
             messages = [] if self.closed else list(self._arrived)
@@ -176,7 +171,6 @@ class LocalTransport(Mailbox):
         self._network = network
 
     def publish(self, data: bytes) -> None:
-        """Send to all other ends."""
         if not self.closed:
             self._network.deliver(self, bytes(data))
 

@@ -26,14 +26,9 @@ from d4orm_planners.d_d4orm.transport import MAX_BYTES, WAITING, Mailbox
 _zenoh: Any = LazyModule("zenoh", "transport 'zenoh'", "zenoh")
 
 logger = logging.getLogger(__name__)
-
-LOOPBACK = ("tcp/127.0.0.1:0",)
-"""Default endpoint that nodes listen at: a free port that only this machine reaches."""
-
+LOOPBACK = ("tcp/127.0.0.1:0",)  #: Default endpoint that nodes listen at: a free port that only this machine reaches
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
-
-LAST_WAIT = 5.0
-"""Seconds to wait for the thread that receives, once there is nothing more to come."""
+LAST_WAIT = 5.0  #: Seconds to wait for the thread that receives, once there is nothing more to come
 
 RESERVED = {
     "listen/endpoints": "listen",
@@ -95,8 +90,7 @@ class ZenohSettings(CheckedSettings):
     #: A zenoh configuration in JSON5, for TLS, access control and whatever else zenoh has; the settings above are not
     #: to be in it
     config_file: PathText | None = None
-    #: Seconds that a node with a solution goes on telling it, until all others have one as good
-    grace_period: Seconds = 2.0
+    grace_period: Seconds = 2.0  #: Seconds that a node goes on telling its solution, until all others have one as good
 
     @classmethod
     def of(cls, settings: object) -> ZenohSettings:
@@ -151,7 +145,6 @@ class ZenohTransport(Mailbox):
         atexit.register(self._leave)
 
     def publish(self, data: bytes) -> None:
-        """Send to all other nodes."""
         if self.closed:
             return
         try:
@@ -161,7 +154,6 @@ class ZenohTransport(Mailbox):
                 logger.warning("a candidate was not sent: %s", _reason(error))
 
     def close(self) -> None:
-        """Leave the network."""
         super().close()
         atexit.unregister(self._leave)
         self._leave()
@@ -177,7 +169,6 @@ class ZenohTransport(Mailbox):
 
 
 def zenoh_config(zenoh: ModuleType, settings: ZenohSettings) -> object:
-    """Zenoh's own configuration."""
     config = plain = zenoh.Config()
     if settings.config_file is not None:
         try:

@@ -28,8 +28,7 @@ from d4orm_planners.engine.sampling_types import (
     StepWatcher,
 )
 
-WORTH_A_THREAD = 2**16
-"""Samples' steps of a robot; fewer are scored before another thread has woken up."""
+WORTH_A_THREAD = 2**16  #: Samples' steps of a robot; fewer are scored before another thread has woken up
 
 
 class CpuSamplingEngine(CpuEngine):
@@ -52,7 +51,6 @@ class CpuSamplingEngine(CpuEngine):
         should_stop: Callable[[], bool] | None = None,
         watcher: StepWatcher | None = None,
     ) -> SamplingResult:
-        """See :meth:`d4orm_planners.engine.sampling_types.SamplingEngine.denoise`."""
         run = Sampling(task, num_samples, seed, self._threads)
         factor, units = task.first_factor, task.problem.team.control_units
         mean_rewards = np.empty(len(noise_scale), np.float32)
@@ -100,7 +98,6 @@ def bound_boxes(arrays: ProblemArrays) -> FloatArray:
 
 
 def make_bodies(moving: MovingObstacles, margin: np.float32) -> Bodies:
-    """The bodies, with their boxes."""
     # Copies, for which one compilation serves: read-only arrays are of another type.
     positions, radius = (np.array(values, np.float32, order="C") for values in (moving.positions, moving.radius))
     num_steps, num_blocks = len(positions), -(-len(positions) // BLOCK)
@@ -200,9 +197,8 @@ class Sampling:
 def _by_counter(weights: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Weights ``(K, M)`` or ``(1, M)`` of samples gathered by the counter of their noise (see :func:`noise.turned`).
 
-    Returns:
-        ``(2, K, .)`` weights in an odd moment, summed over the samples of a counter with the cosine and the sine of
-        their turn, and ``(2, K, .)`` in an even one, with their squares.
+    ``(2, K, .)`` in an odd moment, summed over a counter's samples with the cosine and the sine of their turn, and
+    ``(2, K, .)`` in an even one, with their squares.
     """
     num_rows, num_samples = weights.shape
     if num_samples % TILE:

@@ -22,14 +22,7 @@ from jax.sharding import PartitionSpec as P
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine import noise
-from d4orm_env.jax.jax_engine import (
-    BIT_OPS,
-    JaxEngine,
-    moving_contacts,
-    obstacle_contacts,
-    rewards_of,
-    robot_contacts,
-)
+from d4orm_env.jax.jax_engine import BIT_OPS, JaxEngine, moving_contacts, obstacle_contacts, rewards_of, robot_contacts
 from d4orm_env.jax.jax_footprints import MovingBodies
 from d4orm_env.jax.jax_motion import Worlds, roll_out
 from d4orm_planners.engine.sampling_types import (
@@ -40,8 +33,7 @@ from d4orm_planners.engine.sampling_types import (
     StepWatcher,
 )
 
-LOOK = 0.03
-"""Seconds between looks at whether a run is to be stopped, if that is more than a step; at most twice as many."""
+LOOK = 0.03  #: Seconds between looks at whether a run is to be stopped, if longer than a step; at most twice as many
 
 
 class _Static(NamedTuple):
@@ -246,7 +238,6 @@ class JaxSamplingEngine(JaxEngine):
         return _compiled_denoise(static, treedef, tuple((leaf.shape, leaf.dtype) for leaf in leaves)), arguments
 
     def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
-        """See :meth:`d4orm_planners.engine.sampling_types.SamplingEngine.prepare`."""
         self._lower(task, rules, task.base, noise_scale, num_samples, 0)
 
     def denoise(

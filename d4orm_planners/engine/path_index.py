@@ -28,16 +28,10 @@ from d4orm_planners.engine.path_table import (
 
 
 class PathIndex:
-    """The paths of a team, some of which may change.
+    """The paths ``(H+1, K, d)`` of a team, finite [m], some of which may change; at the start none counts as near.
 
-    Args:
-        positions: ``(H+1, K, d)`` [m], finite; copied. At the start none counts as near.
-        radius: ``(K,)`` [m].
-        margin: Gap that robots are to keep between them [m].
-        flattening: Factor for heights by which balls of these radii stand for the robots.
-
-    Attributes:
-        table: The index as kernels read it.
+    Robots of ``radius`` ``(K,)`` [m] are to keep a gap of ``margin`` [m]; ``flattening`` is the factor for heights by
+    which balls of these radii stand for them.
     """
 
     def __init__(self, positions: FloatArray, radius: ArrayLike, margin: float, flattening: float = 1.0) -> None:
@@ -47,6 +41,7 @@ class PathIndex:
         safety_distance = (2 * radii.max() + margin) / flattening
         # Robots as near to each other as they may be are about one in a cell.
         scale = 1 / (2 * safety_distance)
+        #: The index as kernels read it
         self.table = PathTable(
             BLOCK, positions, np.zeros((num_blocks, num_robots, BLOCK, positions.shape[2]), np.float32), radii,
             np.float64(margin), np.float64(safety_distance), np.float64(scale), np.float64(flattening),
@@ -227,7 +222,6 @@ def check_alone(arrays: ProblemArrays, robots: ArrayLike, states: FloatArray) ->
 def _check_alone(
     arrays: ProblemArrays, robots: IntArray, paths: FloatArray, robot_range: IntArray, steps: Ints
 ) -> None:
-    """See :func:`check_alone`."""
     arrays = borrow(arrays)
     dimension, closed, never = arrays.goal.shape[1], is_closed(arrays), paths.shape[2]
     for r in range(robot_range[0], robot_range[1]):

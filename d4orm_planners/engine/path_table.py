@@ -14,12 +14,9 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Ints, Whole
 from d4orm_env.engine.compiling import compiled, inlined
 
-BLOCK = 8
-"""Steps in a block."""
-
+BLOCK = 8  #: Steps in a block
 NOBODY = np.int32(-1)
-_WIDER = 1 + 2.0**-20
-"""Factor by which distances up to which there may be a robot are stretched for rounding."""
+_WIDER = 1 + 2.0**-20  #: Factor by which distances up to which there may be a robot are stretched for rounding
 
 
 class PathTable(NamedTuple):

@@ -38,12 +38,8 @@ from d4orm_env.engine.simd import (
 )
 from d4orm_env.engine.tiles import near_round
 
-DIGITS = 7
-"""Binary digits that robots near each other are counted in; one tells only whether there are any."""
-
-WIDER = np.float32(1 + 2.0**-6)
-"""Factor by which robots' boxes are stretched for rounding, of coordinates many thousand times as large too."""
-
+DIGITS = 7  #: Binary digits that robots near each other are counted in; one tells only whether there are any
+WIDER = np.float32(1 + 2.0**-6)  #: Stretches boxes for rounding, of coordinates many thousand times as large too
 _CHUNK_BITS = np.uint64((1 << CHUNK) - 1)
 
 
@@ -73,7 +69,6 @@ class Bodies(NamedTuple):
 
 
 def make_scratch(num_robots: int, dimension: int) -> Scratch:
-    """Scratch for one thread."""
     return Scratch(
         aligned_zeros(num_robots * dimension * BOX), np.empty(num_robots, np.int32),
         np.empty((num_robots, num_robots), np.int32), np.empty((DIGITS, num_robots, BLOCK), np.uint64),
@@ -87,8 +82,7 @@ def position_of(k: Whole, step: int, dimension: int) -> Whole:
     return (k * BLOCK + step) * dimension * TILE
 
 
-POSES = BLOCK * POSE * TILE
-"""Numbers of a body's poses in a block."""
+POSES = BLOCK * POSE * TILE  #: Numbers of a body's poses in a block
 
 
 @inlined

@@ -25,9 +25,7 @@ from d4orm_planners.engine.proximity import POSES, pose_of
 # First rows of a robot in the workspace: see tiles, which has others because it keeps more of a robot.
 STATE, ARRIVED, TOTAL, ROWS = 0, 6, 7, 9
 STRIDE = ROWS * TILE
-
-CONTROL_ROWS = 3
-"""Rows of one step's controls."""
+CONTROL_ROWS = 3  #: Rows of one step's controls
 
 
 @compiled

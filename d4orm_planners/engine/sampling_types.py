@@ -30,8 +30,7 @@ class MovingObstacles(NamedTuple):
     positions: FloatArray  #: ``(H, O, d)`` where each body is after every step [m]
     radius: FloatArray  #: ``(O,)`` [m]; outer radii of bodies that are no discs
     footprints: FootprintArrays | None = None  #: Theirs; ``None`` where all are discs
-    #: ``(H, F)`` what turns them and their trailers [rad], or ``None`` where all are discs
-    headings: FloatArray | None = None
+    headings: FloatArray | None = None  #: ``(H, F)`` what turns them and trailers [rad]; ``None`` where all are discs
 
 
 def moving_robots(team: Team, states: FloatArray) -> MovingObstacles:
@@ -45,8 +44,7 @@ class SamplingTask:
     """Distribution to sample from, and rules to score by."""
 
     problem: Problem  #: The robots that are sampled, their world and horizon
-    #: ``(H, K, m)`` controls that the sampled deformation is added to; zeros to sample controls themselves
-    base: FloatArray
+    base: FloatArray  #: ``(H, K, m)`` controls that the sampled deformation is added to; zeros for controls themselves
     collisions: bool = True  #: Whether robots are penalised for coming near each other and near ``moving``
     #: ``"team"`` weights samples by the mean reward of the team (the paper), ``"robot"`` weights each robot's part of a
     #: sample by that robot's own reward
@@ -54,8 +52,7 @@ class SamplingTask:
     moving: MovingObstacles | None = None  #: Bodies to avoid that are not sampled, or ``None``
     arrived: BoolArray | None = None  #: ``(K,)`` robots arrived from the beginning, or ``None`` for none
     penalty: float | FloatArray = 1.0  #: Factor of the problem's collision penalty: of all robots, or ``(K,)`` of each
-    #: Whether a robot pays for every robot and moving body that it is near, not once for all
-    penalty_per_pair: bool = False
+    penalty_per_pair: bool = False  #: A robot pays for every robot and moving body that it is near, not once for all
     #: Factors on the noise of the first step that go with ``(H, K, m)``: zero for robots that are not sampled, so that
     #: their base stays
     noise_factor: float | FloatArray = 1.0
@@ -85,8 +82,7 @@ class SamplingTask:
         return arrays._replace(inverse_initial_distance=inverse)
 
 
-Rule: TypeAlias = Callable[..., Any]
-"""It returns arrays of the library of its arguments."""
+Rule: TypeAlias = Callable[..., Any]  #: It returns arrays of the library of its arguments
 
 
 class SamplingRules(NamedTuple):
@@ -109,11 +105,9 @@ class SamplingResult(NamedTuple):
     """One denoising run."""
 
     mean: FloatArray  #: ``(H, K, m)`` the last weighted mean of the deformations
-    #: ``(N,)`` mean reward of the samples at each step done: fewer than asked for where the run was stopped
-    rewards: FloatArray
+    rewards: FloatArray  #: ``(N,)`` mean reward of the samples at each step done: fewer where the run was stopped
     excluded: int  #: Samples left out because their reward was not finite
-    #: Factors on the noise that a next step would have, that go with ``(H, K, m)``
-    noise_factor: float | FloatArray = 1.0
+    noise_factor: float | FloatArray = 1.0  #: Factors on the noise of a next step, that go with ``(H, K, m)``
 
 
 class DenoisingStep(NamedTuple):
@@ -122,16 +116,13 @@ class DenoisingStep(NamedTuple):
     task: SamplingTask  #: Distribution of the samples, and their scoring
     noise_scale: float  #: Standard deviation of the samples
     mean: FloatArray  #: ``(H, K, m)`` the weighted mean of the deformations, which the next step samples around
-    #: ``(S, H, K, m)`` the first deformations that it is the mean of, at most :data:`WATCHED_SAMPLES`
-    samples: FloatArray
+    samples: FloatArray  #: ``(S, H, K, m)`` the first deformations that it averages, up to :data:`WATCHED_SAMPLES`
     #: ``(S,)`` what they count for with team credit, ``(K, S)`` with robot credit; those of all ``M`` samples add up to
     #: one
     weights: FloatArray
 
 
-WATCHED_SAMPLES = 8
-"""Samples of a :class:`DenoisingStep`, where as many are drawn."""
-
+WATCHED_SAMPLES = 8  #: Samples of a :class:`DenoisingStep`, where as many are drawn
 StepWatcher = Callable[[DenoisingStep], object]
 
 

@@ -14,8 +14,7 @@ from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, aligned_zeros, compil
 from d4orm_env.engine.noise import DRAWS
 from d4orm_env.engine.simd import add_turned, add_turned_squares, use_wide_registers
 
-LANES = 16
-"""Sums run over as many parts side by side, whatever the width of registers."""
+LANES = 16  #: Sums run over as many parts side by side, whatever the width of registers
 
 # exp(x) = 2^n exp(r), with n the nearest whole number to x / ln 2 and a minimax polynomial for r (Cephes, expf).
 _LOWEST = np.float32(-87)
@@ -23,9 +22,7 @@ _ONE_OVER_LN2, _LN2_HIGH, _LN2_LOW = np.float32(1.44269504), np.float32(0.693359
 _E2, _E3, _E4 = np.float32(5.0000001201e-1), np.float32(1.6666665459e-1), np.float32(4.1665795894e-2)
 _E5, _E6, _E7 = np.float32(8.3334519073e-3), np.float32(1.3981999507e-3), np.float32(1.9875691500e-4)
 _HALF, _BIAS, _MANTISSA = np.float32(0.5), np.int32(127), np.int32(23)
-
-_LEAST_SPREAD = np.float32(1e-6)
-"""Below this spread all samples are as good as equal, and amplifying rounding would be noise."""
+_LEAST_SPREAD = np.float32(1e-6)  #: Below this spread samples are as good as equal; amplified, rounding is noise
 _LEAST_SUM = np.float32(1e-30)
 _NOTHING = np.float32(-np.inf)
 

@@ -73,7 +73,6 @@ def milliseconds(spread: Spread | None) -> str:
 
 
 def seconds(spread: Spread) -> str:
-    """Median and quartiles in s."""
     return f"{spread.median:.2f} ({spread.lower_quartile:.2f}-{spread.upper_quartile:.2f})"
 
 

@@ -32,12 +32,8 @@ CONTROL_LOOPS: tuple[tuple[str, Mode], ...] = (
 )  # fmt: skip
 """Models of the robots whose control loops are timed, and the controller's modes."""
 
-FIRST_STEPS = 5
-"""Steps at the largest noise that are run together to time one."""
-
-Run: TypeAlias = Callable[[FloatArray, bool], object]
-"""``(noise_scale, collisions)`` to what is timed."""
-
+FIRST_STEPS = 5  #: Steps at the largest noise that are run together to time one
+Run: TypeAlias = Callable[[FloatArray, bool], object]  #: ``(noise_scale, collisions)`` to what is timed
 Part = tuple[str, str, Callable[[], Measurement]]
 
 

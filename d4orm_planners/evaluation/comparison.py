@@ -25,8 +25,7 @@ class Paired:
     pairs: int  #: Number of trials that they have in common
     only_first: int  #: Those in which only the first succeeded
     only_second: int  #: Those in which only the second did
-    #: Probability that two equally good policies differ so much in successes: McNemar's exact test, two-sided
-    success_p: float
+    success_p: float  #: Probability that equals differ so much in successes: McNemar's exact test, two-sided
     difference: float  #: Median of the first's cost less the second's
     cost_p: float  #: The same for the costs: Wilcoxon's signed-rank test, two-sided
 

@@ -23,15 +23,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 figures: Any = LazyModule("matplotlib.figure")
-
-KINDS = ("pdf", "svg", "png")
-"""Files of a figure."""
-COLUMN, PAGE = 3.5, 7.16
-"""Width of a column and of a page of two [inches]."""
-_LETTERS = 28
-"""Letters that fit over a map beside each other."""
-_LEGEND_LETTERS = 50
-"""Letters of a legend that fit in a column beside each other, five for each symbol."""
+KINDS = ("pdf", "svg", "png")  #: Files of a figure
+COLUMN, PAGE = 3.5, 7.16  #: Width of a column and of a page of two [inches]
+_LETTERS = 28  #: Letters that fit over a map beside each other
+_LEGEND_LETTERS = 50  #: Letters of a legend that fit in a column beside each other, five for each symbol
 
 _STYLE = {
     "text.parse_math": False,  # no name is a formula

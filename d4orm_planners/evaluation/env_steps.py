@@ -31,15 +31,9 @@ jnp: Any = LazyModule("jax.numpy")
 DISTURBANCES: tuple[AnyDisturbance, ...] = (Delay(2), Dropout(0.3), StateNoise(0.02, 0.05))
 """Disturbances of environments that are stepped beside those that nothing disturbs."""
 
-RIGID = ("holonomic2d", "differential_drive")
-"""Models that are stepped as rigid bodies, where MuJoCo is installed."""
-
-
-RECTANGLE = Box(0.36, 0.24)
-"""Footprint of robots that are stepped beside discs."""
-
-RAYS, RAY_BOXES = 32, 100
-"""Rays of the range sensors of environments that are stepped beside those without, and boxes that they meet."""
+RIGID = ("holonomic2d", "differential_drive")  #: Models that are stepped as rigid bodies, where MuJoCo is installed
+RECTANGLE = Box(0.36, 0.24)  #: Footprint of robots that are stepped beside discs
+RAYS, RAY_BOXES = 32, 100  #: Rays of range sensors of environments stepped with them, and boxes that they meet
 
 
 def measure_env(
@@ -62,7 +56,6 @@ def measure_env(
 
 
 def measure_rigid(settings: BenchmarkSettings, model: str) -> Measurement:
-    """The same of rigid bodies in MuJoCo."""
     env = open_env(make_problem("circle", num_robots=8, model=model, horizon=settings.horizon), "mujoco")
     seconds = _measure_steps(settings, env, max(1, settings.env_steps // 10))
     return _rate(f"mujoco, {model}", 1, 0, (), seconds)

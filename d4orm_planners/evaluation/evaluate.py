@@ -23,8 +23,7 @@ from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_r
 from d4orm_planners.evaluation.tables import PARQUET_HINT, write_results
 from d4orm_planners.evaluation.trials import Job
 
-SHARD_STORES = "trials-*.sqlite"
-"""Stores of shards in a folder."""
+SHARD_STORES = "trials-*.sqlite"  #: Stores of shards in a folder
 Progress = Callable[[str, int, int], object]
 
 
@@ -75,7 +74,7 @@ def evaluate(
         time_limit: Seconds for planning, for planners without a ``time_limit`` of their own.
         physics: Physics of the robots: ``"model"``, the equations that planners know, ``"mujoco"`` or ``"crazyflow"``,
             with settings of their bodies as ``"crazyflow:gust=0.02"``: see
-            :func:`~d4orm_planners.base.physics.find_physics`. Executed controls are not judged by
+            :func:`~d4orm_planners.base.episode.find_physics`. Executed controls are not judged by
             :func:`d4orm_env.verify` then.
         observation: Arguments of the environment on what robots observe, as ``{"observed_rays": 32}``.
         trial_timeout: Seconds after which a trial is ended with an error; ``None`` waits.
@@ -190,7 +189,6 @@ def run_shard(
 
 
 def _checked_groups(study: Study, trial_timeout: float | None, workers: int | None) -> list[list[Job]]:
-    """The jobs of a study that is to run with these."""
     if trial_timeout is not None:
         duration(trial_timeout, "trial_timeout")
     if workers is not None:

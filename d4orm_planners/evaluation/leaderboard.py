@@ -25,7 +25,6 @@ Computing is the time of planning, or of choosing all actions, per second that t
 for a whole episode, *decision* that of one step for the whole team, without what came before the first one, and
 *training* all that a learned policy's file tells of."""
 
-
 WITHIN = """\
 From the histories of the same trials: those that succeeded and had a solution by then. Policies that plan while they
 act count with all the time of an episode."""

@@ -22,8 +22,7 @@ MODELS = (
     *COMMON, "unicycle", "unicycle1", "unicycle2", "car", "car_first_order", "holonomic2d_jerk", "holonomic3d_drag",
 )  # fmt: skip
 
-Robots = Annotated[Count, Field(le=10_000)]
-"""Number of robots, as many as scenarios make."""
+Robots = Annotated[Count, Field(le=10_000)]  #: Number of robots, as many as scenarios make
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,21 +40,18 @@ class BenchmarkSettings(CheckedSettings):
     repetitions: Count = 20  #: Calls per measurement at most
     time_limit: Positive = 2.0  #: Seconds per measurement, after which no further call begins
     iteration_limit: Positive = 20.0  #: Whole iterations expected to take longer than this are left out [s]
-    #: Largest team for engines other than the CPU engine and, on an accelerator, JAX
-    most_robots_slow: Annotated[Whole, Field(ge=0)] = 16
+    most_robots_slow: Annotated[Whole, Field(ge=0)] = 16  #: Largest team but on the CPU engine and accelerators
     env_steps: Count = 2000  #: Environment steps per repetition
     num_worlds: Steps = 1024  #: Worlds in the batched environment
     plan_robots: tuple[Robots, ...] = (4, 8, 12, 16)  #: Team sizes for the first feasible plan
     seeds: Count = 20  #: Seeds ``0, 1, ...`` per team size
     plan_time_limit: Positive = 20.0  #: Seconds per plan
-    #: Team sizes whose iterations are timed with several threads and with one
-    thread_robots: tuple[Robots, ...] = (8, 16, 64)
+    thread_robots: tuple[Robots, ...] = (8, 16, 64)  #: Teams whose iterations are timed with several threads and one
     memory_robots: Robots = 64  #: Team size of the memory measurement
     obstacles: tuple[Count, ...] = (4, 200, 1000, 5000)  #: Numbers of boxes among the paths of 8 robots
     far_obstacles: tuple[Count, ...] = (200,)  #: The same of boxes far away; also what environments are stepped among
     map_cells: tuple[Count, ...] = (32, 256)  #: Cells along a side of the maps whose index of obstacles is timed
-    #: Team sizes for the first plan of the recommended planner on open ground
-    big_random: tuple[Robots, ...] = (1000, 2000)
+    big_random: tuple[Robots, ...] = (1000, 2000)  #: Team sizes for the default planner's first plan on open ground
     big_warehouse: tuple[Robots, ...] = (100, 200)  #: The same in warehouses
     big_drives: tuple[Robots, ...] = (100,)  #: The same of differential drives
     big_boxes: tuple[Robots, ...] = (16, 50)  #: The same of rectangles with goal headings in warehouses
@@ -88,9 +84,7 @@ QUICK: Mapping[str, object] = {
 }  # fmt: skip
 """Settings of a benchmark of about a minute, for a first look; starts and controllers take as long by themselves."""
 
-
-Measurement: TypeAlias = dict[str, Any]
-"""Measurement of one case, by column: numbers, texts and :class:`Spread`."""
+Measurement: TypeAlias = dict[str, Any]  #: Measurement of one case, by column: numbers, texts and :class:`Spread`
 
 
 @dataclass(frozen=True)

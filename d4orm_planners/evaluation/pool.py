@@ -1,7 +1,8 @@
 """Jobs in processes, of this machine or on Ray, and what happens when one dies or a part takes too long.
 
 Trials and recorded episodes are such jobs: their results come one by one, so that what is done is not lost. A thread of
-an executor waits for each process, for executors of processes cannot end a single one.
+an executor waits for each process, for executors of processes cannot end a single one. Of processes that would write
+to one folder only one may (:func:`only_writer`).
 """
 
 from __future__ import annotations
@@ -13,26 +14,27 @@ import threading
 from collections import deque
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Protocol, Self, TypeVar
 
 from d4orm_env.core.errors import describe
 from d4orm_planners.d_d4orm.ray_planner import RayConnection
 
-Result = TypeVar("Result")
+try:
+    import fcntl
+except ImportError:  # Windows: nobody is kept off
+    fcntl = None  # type: ignore[assignment]
 
-BEGUN = "begun"
-"""Word of a process that it has begun a job; the results follow it."""
-RAY_USE = "running on a cluster"
-"""Use of Ray here, for the error without it."""
-QUEUED = 2
-"""Jobs under way per core of the cluster: one that runs, and one that need not be waited for."""
-ENDING = 0.1
-"""Seconds between looks at whether processes that were stopped have ended."""
+Result = TypeVar("Result")
+BEGUN = "begun"  #: Word of a process that it has begun a job; the results follow it
+RAY_USE = "running on a cluster"  #: Use of Ray here, for the error without it
+QUEUED = 2  #: Jobs under way per core of the cluster: one that runs, and one that need not be waited for
+ENDING = 0.1  #: Seconds between looks at whether processes that were stopped have ended
 
 
 class Work(Protocol[Result]):
@@ -269,3 +271,25 @@ def _work_remotely(job: Work[Any]) -> Iterator[Any]:
     """Run a job on one core of some machine."""
     os.environ.update(D4ORM_NUM_THREADS="1", OMP_NUM_THREADS="1")
     yield from _contents(job)
+
+
+@contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Keep others that ask likewise from writing to a folder meanwhile; the system ends it for a process that dies."""
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise OSError(
+            f"folder {folder} is being written to by another process; wait until that has ended, or choose another"
+        ) from None
+    except OSError:  # a file system without locks
+        pass
+    try:
+        yield
+    finally:
+        os.close(handle)

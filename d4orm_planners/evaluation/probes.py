@@ -63,18 +63,13 @@ planner.solve(problem, seed=0, max_iterations=2)
 print(json.dumps({"imported": imported, "peak": peak()}))
 """
 
-
-DEADLINE = 0.9
-"""Share of a time step within which controllers answer."""
+DEADLINE = 0.9  #: Share of a time step within which controllers answer
 CONTROLLED = 10
-WARMUP = 10
-"""Loops at the beginning that do not count: they may compile."""
+WARMUP = 10  #: Loops at the beginning that do not count: they may compile
 Where = Literal["near", "far"]
 NUM_ROBOTS = 8
-SIZE = 0.04
-"""Side of a box [m]."""
-CELL, BLOCKED = 0.6, 0.2
-"""Size of the cells of a map [m], and the share of them that is blocked."""
+SIZE = 0.04  #: Side of a box [m]
+CELL, BLOCKED = 0.6, 0.2  #: Size of the cells of a map [m], and the share of them that is blocked
 
 
 def _run(code: str, *arguments: object, cache: str | None = None) -> tuple[float, Measurement]:
@@ -180,10 +175,7 @@ def measure_index(cells: int) -> Measurement:
     return {"cells": cells, "obstacles": shapes.count, "seconds": time.perf_counter() - begin, "bytes": index.num_bytes}
 
 
-COMPILING = 12
-"""Robots of a problem that is solved first, so that compiling does not count."""
-
-
+COMPILING = 12  #: Robots of a problem that is solved first, so that compiling does not count
 BOXES: dict[str, Any] = {"model": "differential_drive", "footprint": Box(0.36, 0.24), "goal_heading": 0.0}
 """Robots whose manoeuvres are planned: rectangles with goal headings."""
 
@@ -196,11 +188,7 @@ def measure_big_team(
     planner.solve(make(num_robots=COMPILING, seed=seeds), seed=0, time_limit=time_limit)
     problems = [make(num_robots=num_robots, seed=seed) for seed in range(seeds)]
     plans = [planner.solve(problem, seed=seed, time_limit=time_limit) for seed, problem in enumerate(problems)]
-    return {
-        "scenario": f"{scenario}, {what}" if robots else scenario,
-        "num_robots": num_robots,
-        **figures_of(plans),
-    }
+    return {"scenario": f"{scenario}, {what}" if robots else scenario, "num_robots": num_robots, **figures_of(plans)}
 
 
 def figures_of(plans: Sequence[Plan]) -> Measurement:

@@ -16,8 +16,7 @@ from d4orm_planners.evaluation.disturbance_figures import draw_lines, draw_map, 
 from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates
 from d4orm_planners.evaluation.tables import errors, interval, markdown, panels, table, write_csv, write_rates
 
-THRESHOLD = 0.9
-"""Share of the undisturbed success rate below which a policy is said to tolerate a disturbance no longer."""
+THRESHOLD = 0.9  #: Share of the undisturbed success rate below which a policy no longer tolerates a disturbance
 
 _PAIRS = """\
 Trials with the same problem, seed and disturbance. *Only first* and *only second* count those in which one of the two
@@ -175,8 +174,7 @@ class Tolerance:
     #: The first level with a success rate below the threshold; ``None`` if it tolerates all. Both are ``None`` where no
     #: level can be named: without an undisturbed success rate, or with one of 0.
     fails: float | None
-    #: Success rate without any disturbance but the noise; ``None`` if no level without effect was run
-    undisturbed: float | None
+    undisturbed: float | None  #: Success rate with nothing but the noise; ``None`` if no level without effect was run
     threshold: float | None  #: That share of it
 
     @property

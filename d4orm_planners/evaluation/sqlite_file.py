@@ -11,11 +11,9 @@ from pathlib import Path
 
 from d4orm_env.core.errors import FileAccessError
 
-APPLICATION_ID = 0x64346F72
-"""Marks the file as one of ours, in its header ("d4or")."""
+APPLICATION_ID = 0x64346F72  #: Marks the file as one of ours, in its header ("d4or")
 VERSION = 10
-TIMEOUT = 60.0
-"""Seconds to wait for another writer."""
+TIMEOUT = 60.0  #: Seconds to wait for another writer
 
 
 class SqliteFile:
@@ -64,7 +62,6 @@ class SqliteFile:
         return sqlite3.connect(name, uri=True, timeout=TIMEOUT, isolation_level=None)
 
     def _make(self, connection: sqlite3.Connection, columns: str) -> None:
-        """Make the table in a new file."""
         if _pragma(connection, "application_id") != APPLICATION_ID:
             # One transaction, so that of two processes that find no file one makes the table.
             connection.execute("BEGIN IMMEDIATE")

@@ -15,8 +15,7 @@ from d4orm_env.core.arrays import LARGEST_WHOLE, short_repr
 from d4orm_env.core.errors import MissingFileError
 from d4orm_planners.evaluation.sqlite_file import SqliteFile
 
-STORE = "trials.sqlite"
-"""Name of the file in a folder of results."""
+STORE = "trials.sqlite"  #: Name of the file in a folder of results
 
 
 class TrialKey(NamedTuple):
@@ -30,7 +29,7 @@ class TrialKey(NamedTuple):
     control_noise_std: float  #: Standard deviation of the execution noise, in the controls' units
     seed: int  #: Seed of the episode: of the policy and of the noise
     disturbances: str = "[]"  #: Further disturbances, as JSON: a list of ``[name, attributes]``
-    physics: str = "model"  #: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`
+    physics: str = "model"  #: Physics of the robots, see :func:`~d4orm_planners.base.episode.find_physics`
 
 
 class BestSoFar(NamedTuple):
@@ -66,13 +65,11 @@ class Trial:
     machine: str = "{}"  #: Processor, cores and system, as JSON, likewise
     date: str = ""  #: Time at which the trial ended, UTC, ISO 8601
     success: bool = False  #: Everyone arrived in time, and none was ever in contact
-    #: Whether :func:`d4orm_env.verify` found no fault with the executed controls; ``None`` if not judged
-    verified: bool | None = None
+    verified: bool | None = None  #: :func:`d4orm_env.verify` found no fault in the controls; ``None`` if not judged
     violation: str = ""  #: The first fault that it found
     collided: int = 0  #: Robots that were ever in contact
     arrived: int = 0  #: Robots that arrived
-    #: Mean arrival time [s], with the time of the whole episode for a robot that did not arrive
-    travel_time: float | None = None
+    travel_time: float | None = None  #: Mean arrival time [s], the whole episode's for a robot that did not arrive
     makespan: float | None = None  #: Latest arrival time [s], likewise
     #: Path travelled over the shortest path, see :func:`d4orm_env.core.trajectory.mean_stretch`; ``None`` if no robot
     #: arrived, and in rows that older versions wrote
@@ -81,8 +78,7 @@ class Trial:
     mean_squared_jerk: float | None = None  #: See :func:`d4orm_env.core.trajectory.mean_squared_jerk` [m^2/s^6]
     steps: int = 0  #: Steps of the episode
     iterations: int | None = None  #: Iterations of the planner; ``None`` for a policy that executes no plan
-    #: Share of them that denoised; 0 where the plan is search's and path finding's alone
-    denoising_share: float | None = None
+    denoising_share: float | None = None  #: Share of them that denoised; 0 for search and path finding alone
     status: str = ""  #: End of its solve, see :class:`d4orm_planners.base.plan.Plan`
     wall_time: float | None = None  #: Seconds spent planning, or choosing actions
     #: Those of ``wall_time`` before the first action: the whole solve of a plan, the coarse plan of a controller;
@@ -94,8 +90,7 @@ class Trial:
     #: Times in the solve at which the best plan so far changed, as JSON: a list of :attr:`progress`, without its last
     #: two in rows that older versions wrote; empty for a policy that executes no plan.
     history: str = "[]"
-    #: Candidates that the nodes of a distributed planner sent, each to all others; ``None`` for others
-    messages: int | None = None
+    messages: int | None = None  #: Candidates that a distributed planner's nodes sent, each to all others
     message_bytes: int | None = None  #: Their length together
     waiting_share: float | None = None  #: Share of the nodes' time that they waited for each other
     error: str = ""  #: Why there is no outcome; empty for a trial that ran to its end
@@ -130,8 +125,7 @@ class Trial:
 _NAMES = tuple(field.name for field in fields(Trial))
 _KEY = ", ".join(TrialKey._fields)
 _TRUTHS = ("success", "verified")
-_MACHINE = {"processor", "cores", "cores_used", "python"}
-"""Least keys of a machine's description."""
+_MACHINE = {"processor", "cores", "cores_used", "python"}  #: Least keys of a machine's description
 
 
 def _are_lists(content: Any, *lengths: int) -> bool:
@@ -248,7 +242,6 @@ def checked_trial(values: Mapping[str, Any]) -> Trial:
 
 
 def _is_json(text: str, is_right: Callable[[Any], bool]) -> bool:
-    """Check whether a text is JSON, and as it must be."""
     try:
         return is_right(json.loads(text))
     except (ValueError, RecursionError):

@@ -23,9 +23,8 @@ from d4orm_env.envs.options import OBSERVATION, EnvOptions
 from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.problems import is_scenario_file
-from d4orm_planners.base.physics import find_physics
-from d4orm_planners.base.planner_registry import PolicyLike, is_brought, list_policies, origin
-from d4orm_planners.base.policy_copies import fresh_policy
+from d4orm_planners.base.episode import find_physics
+from d4orm_planners.base.planner_registry import PolicyLike, fresh_policy, is_brought, list_policies, origin
 from d4orm_planners.evaluation.trials import Condition, Configuration, Job
 
 T = TypeVar("T")
@@ -147,7 +146,6 @@ class Study:
 
 
 def _labelled(policies: Policies) -> dict[str, tuple[PolicyLike, dict[str, object]]]:
-    """Policies and their settings by label."""
     if isinstance(policies, Mapping):
         return {_checked_label(label): _checked(label, given) for label, given in policies.items()}
     labelled: dict[str, tuple[PolicyLike, dict[str, object]]] = {}
@@ -169,7 +167,6 @@ def _checked_label(label: object) -> str:
 
 
 def _checked(label: str, given: Any) -> tuple[PolicyLike, dict[str, object]]:
-    """A policy and its settings."""
     if isinstance(given, Mapping):
         settings = dict(given)
         return settings.pop("policy", label), settings
@@ -273,6 +270,5 @@ def _levels_of(chosen: Sequence[tuple[AnyDisturbance, ...]]) -> list[float]:
 
 
 def _numbers_or_indices(values: Sequence[Any]) -> list[float]:
-    """The values if all are numbers, or else their indices."""
     numbers = all(isinstance(value, Real) and not isinstance(value, bool | np.bool_) for value in values)
     return [float(value if numbers else index) for index, value in enumerate(values)]

@@ -36,7 +36,7 @@ class Compared:
     control_noise_std: float  #: Standard deviation of the execution noise, in the controls' units
     disturbance: str = ""  #: Further disturbance, such as ``"push.speed"``; empty for nothing
     level: float | None = None  #: Its level
-    physics: str = "model"  #: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`
+    physics: str = "model"  #: Physics of the robots, see :func:`~d4orm_planners.base.episode.find_physics`
     undisturbed: bool = False  #: True if no disturbance changed anything, as at level zero
     trials: int  #: Trials, those with an error included
     successes: int  #: Those that succeeded
@@ -70,10 +70,7 @@ class Compared:
 
 @dataclass(frozen=True, kw_only=True)
 class SuccessRate(Compared):
-    """Rate at which all arrived in time and none was ever in contact, and the time taken.
-
-    Intervals are of 95% confidence.
-    """
+    """Rate at which all arrived in time and none was ever in contact, and the time taken; intervals are of 95%."""
 
     #: Trials with whose executed controls :func:`d4orm_env.verify` found no fault; ``None`` where none could be judged
     verified: int | None
@@ -83,13 +80,11 @@ class SuccessRate(Compared):
     travel_time_lower: float | None  #: Lower end of its interval (Student's t); ``None`` with fewer than two successes
     travel_time_upper: float | None  #: Upper end
     stretch: float | None  #: Mean over the successes of the path travelled over the shortest path; ``None`` without any
-    #: Median denoising steps until the last better plan; ``None`` where no plan is executed
-    denoising_steps: float | None
+    denoising_steps: float | None  #: Median denoising steps until the last better plan; ``None`` without a plan
     denoising_share: float | None  #: Mean share of the iterations that denoised, where it is known
     #: Mean share of the time until then that was spent denoising; ``None`` unless it is known of all plans
     denoising_time_share: float | None
-    #: Median seconds of planning, or of choosing all actions, in a trial; ``None`` if all raised errors
-    wall_time: float | None
+    wall_time: float | None  #: Median seconds of planning or choosing actions per trial; ``None`` if all raised errors
     #: Median seconds of choosing the actions of one step, without what came before the first one; ``None`` if all
     #: raised errors
     decision: float | None
@@ -115,9 +110,7 @@ class SuccessWithin:
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float | None, float | None, float | None]:
-    """Mean of a sample, and its 95% confidence interval by Student's t; ``None`` for what takes more values than there
-    are.
-    """
+    """Mean, and its 95% confidence interval by Student's t; ``None`` for what takes more values than there are."""
     if not values:
         return None, None, None
     mean = float(np.mean(values))
@@ -137,7 +130,6 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
 
 def success_rates(groups: Iterable[TrialGroup]) -> list[SuccessRate]:
-    """Sum up groups of trials, see :func:`success_rate`."""
     return [
         replace(success_rate(group.trials, group.label), disturbance=group.disturbance, level=group.level)
         for group in groups

@@ -22,11 +22,8 @@ if TYPE_CHECKING:
 
 pyarrow: Any = LazyModule("pyarrow", "Parquet", "evaluate")
 parquet: Any = LazyModule("pyarrow.parquet", "Parquet", "evaluate")
-
-MAX_TRIALS, MAX_BYTES = 10**7, 2**32
-"""Limits of a Parquet file that is read."""
-LATER = {"denoising_share"}
-"""Columns that files of earlier versions do not have."""
+MAX_TRIALS, MAX_BYTES = 10**7, 2**32  #: Limits of a Parquet file that is read
+LATER = {"denoising_share"}  #: Columns that files of earlier versions do not have
 PARQUET_HINT = "trials.parquet is not written, which needs pyarrow; install it with: pip install 'd4orm-env[evaluate]'"
 HEADER = ("policy", "noise", "success", "95% interval", "verified", "contact", "not in time", "errors",
           "travel time, s", "stretch", "denoising steps", "denoising, iterations", "denoising, time", "planning, s",
@@ -61,9 +58,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
 
 
 def write_parquet(path: Path, trials: Sequence[Trial]) -> bool:
-    """Write trials as Parquet, one column per attribute; return ``False``, without writing, where pyarrow is not
-    installed.
-    """
+    """Write trials as Parquet, one column per attribute; ``False``, and nothing written, without pyarrow."""
     try:
         load(pyarrow)
     except ImportError:
@@ -166,7 +161,6 @@ def interval(mean: float | None, lower: float | None, upper: float | None, digit
 
 
 def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table of texts under a heading."""
     head, *body = (f"| {' | '.join(map(markdown_text, row))} |" for row in (header, *rows))
     return "\n".join([f"### {markdown_text(title)}", "", head, "|" + "---|" * len(header), *body])
 

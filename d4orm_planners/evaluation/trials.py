@@ -11,9 +11,10 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from pettingzoo import ParallelEnv
 
 from d4orm_env import verify
 from d4orm_env.core.arrays import FloatArray, plain_number
@@ -24,14 +25,10 @@ from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.disturbance_registry import attributes_of, name_of
 from d4orm_planners.base.episode import Episode, open_env, run_episode
 from d4orm_planners.base.plan import IterationRecord, Plan
-from d4orm_planners.base.planner_registry import is_planned, policy_settings
+from d4orm_planners.base.planner_registry import fresh_policy, is_planned, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, OpenLoop, Policy
-from d4orm_planners.base.policy_copies import fresh_policy
 from d4orm_planners.base.provenance import commit, describe_machine, versions
 from d4orm_planners.evaluation.store import Trial, TrialKey
-
-if TYPE_CHECKING:
-    from pettingzoo import ParallelEnv
 
 PACKAGES = (
     *(str(Path(__file__).parents[2] / name) for name in ("d4orm_env", "d4orm_planners")),
@@ -48,15 +45,12 @@ class Condition:
     control_noise_std: float = 0.0  #: Standard deviation of the execution noise, in the controls' units
     disturbances: tuple[AnyDisturbance, ...] = ()  #: Further disturbances
     name: str = ""  #: Varied quantity, such as ``"push.speed"``; empty for nothing
-    #: Its level; of disturbances that differ in more than a number, their index among the levels
-    level: float | None = None
-    physics: str = "model"  #: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`
+    level: float | None = None  #: Its level; of disturbances that differ in more than a number, their index
+    physics: str = "model"  #: Physics of the robots, see :func:`~d4orm_planners.base.episode.find_physics`
 
     @property
     def text(self) -> str:
-        """The disturbances that change anything, as JSON: a list of ``[name, attributes]``; ValueError for what has no
-        such form.
-        """
+        """The effective disturbances as JSON, ``[name, attributes]`` each; ValueError for what has no such form."""
         listed = [[name_of(one), _attributes(one)] for one in self.disturbances if not one.negligible]
         return _stored(listed, f"disturbance {self.name!r} has an attribute")
 
@@ -84,9 +78,7 @@ class Configuration:
 
     @cached_property
     def config(self) -> str:
-        """All settings, the digest of a user's source, and what is observed, as JSON with sorted keys; ValueError
-        likewise.
-        """
+        """All settings, a user's source's digest, and what is observed, as sorted JSON; ValueError likewise."""
         observed = {"observation": dict(self.observation)} if self.observation else {}
         settings = policy_settings(self.source, **self.settings)
         return _stored(settings | observed, f"policy {self.label!r} has a setting")
@@ -112,7 +104,6 @@ class Job:
     imports: tuple[str, ...] = ()
 
     def key(self, condition: Condition) -> TrialKey:
-        """Return the key of the trial under one condition."""
         policy, noise = self.policy, condition.control_noise_std
         key = (policy.policy, policy.config, self.problem.digest, noise, self.seed, condition.text, condition.physics)
         return TrialKey(*key)
@@ -132,7 +123,6 @@ class Job:
 
     @property
     def num_parts(self) -> int:
-        """Number of trials."""
         return len(self.conditions)
 
     def run(self) -> Iterator[Trial]:
@@ -199,7 +189,6 @@ def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, 
 
 
 def _verdict(problem: Problem, episode: Episode) -> dict[str, object]:
-    """Verify the executed controls."""
     report = verify(problem, episode.controls)
     return {"verified": report.ok, "violation": "" if report.ok else str(report.violations[0])}
 
@@ -228,7 +217,6 @@ class _TimedPolicy(Policy):
 
     @property
     def training_time(self) -> float | None:
-        """Training time of what acts, see :attr:`Trial.training_time`."""
         time: float | None = getattr(self.actor, "training_time", None)
         return time
 

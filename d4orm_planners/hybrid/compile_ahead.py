@@ -114,7 +114,6 @@ def index_paths(models: tuple[str, ...]) -> None:
 
 
 def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
-    """Sample once for teams of these models on the CPU."""
     for models in teams:
         problem = smallest_problem(models)
         task = SamplingTask(problem, no_controls(problem))

@@ -44,8 +44,7 @@ class Queries(NamedTuple):
     robots: IntArray  #: ``(R,)`` their numbers in the team
     blocks: IntArray  #: ``(R,)`` the block at whose beginning their new paths begin,
     states: FloatArray  #: ``(R, n)`` and in which state
-    #: ``(R,)`` what their paths must cost less than [s]: the step at which one ends, and what contacts cost
-    limits: Floats
+    limits: Floats  #: ``(R,)`` what their paths must cost less than [s]: step of the end, and contacts
     others: OtherAgents  #: Agents that they mind, or do not mind
 
 

@@ -149,9 +149,7 @@ def _move_follower(model: Model) -> Callable[..., int]:
 
 
 def _path_grower(model: Model) -> Callable[..., tuple[Whole, Ending]]:
-    """Function that goes on from every path in the beam by every move for a block: how many paths are new, and the best
-    one that arrives.
-    """
+    """Function that continues every path by every move for a block: how many are new, and the best that arrives."""
     drive_block, d = block_driver(model), model.dimension
 
     @inlined

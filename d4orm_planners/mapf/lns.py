@@ -28,30 +28,20 @@ from d4orm_planners.mapf.roundabout import drive_roundabout
 from d4orm_planners.tracking.steering import straight_drives
 
 S_co = TypeVar("S_co", covariant=True)
-
-ROUNDS = 96
-"""Rounds of the search in an iteration: one annealing."""
-FIRST_ROUNDS = 4
-"""Rounds for a plan that has just been found."""
-GUIDED_ROUNDS = 8
-"""The same for one that was found on a roadmap, with all its corners and stops."""
-FIRST_ROBOT_STEPS = 2**19
-"""Steps of all robots in these rounds together: in a large world there are fewer, for the first plan not to wait."""
+ROUNDS = 96  #: Rounds of the search in an iteration: one annealing
+FIRST_ROUNDS = 4  #: Rounds for a plan that has just been found
+GUIDED_ROUNDS = 8  #: The same for one that was found on a roadmap, with all its corners and stops
+FIRST_ROBOT_STEPS = 2**19  #: Steps of all robots in these rounds together: few rounds in a large world
 GROUPS, GROUP_SIZE = 8, 2
 """Groups of robots that look for paths at the same time, not minding each other, so that all cores have work, and most
 robots in one. What a group finds is taken over only if it fits what those before it have found."""
-GIVE = 0.5
-"""Delay that a robot of a group may accept for the sake of those after it [s]."""
-TEMPERATURE = 0.05
-"""Worsening at which a group's paths are still accepted, on average and at first [s]."""
-LEAST_DELAY = 0.02
-"""A robot that arrives as soon as alone is chosen as often as one so much later [s]."""
-NEARNESS = 20 / 3
-"""Random distance by which a robot may be farther away and still be chosen for a group, in radii of the largest."""
+GIVE = 0.5  #: Delay that a robot of a group may accept for the sake of those after it [s]
+TEMPERATURE = 0.05  #: Worsening at which a group's paths are still accepted, on average and at first [s]
+LEAST_DELAY = 0.02  #: A robot that arrives as soon as alone is chosen as often as one so much later [s]
+NEARNESS = 20 / 3  #: Random distance by which a robot may be farther and still join a group, in radii of the largest
 ANGLES, SCALES = np.array([10.0, 20.0, 35.0, 60.0, 100.0]), (0.4, 1.6)
 """Angles by which robots turn off [degrees], all times the same number, which is between these and drawn each round."""
-PACES = (1.0, 0.7, 0.35, 0.0)
-"""Shares of their speed with which they head for their goals."""
+PACES = (1.0, 0.7, 0.35, 0.0)  #: Shares of their speed with which they head for their goals
 WIDTH, DEDUP_DISTANCE, CONTACT = 32, 2 / 3, 1e6
 """Paths that a search keeps after each block of steps; least distance between two in the same radii, or else twice as
 much in speed [1/s]; and the cost of meeting another robot [s]: too much."""
@@ -79,15 +69,11 @@ class Odds(NamedTuple):
 class LowLevelPlanner(Protocol[S_co]):
     """A solution, and the search for other paths in it.
 
-    Attributes:
-        groups: Neighbourhoods that are replanned in a round.
-        solution: The solution as it is now, which later rounds do not change.
-        cost: What it costs; can be compared.
-        odds: Chances of the robots.
-        replan: Finds other paths for groups, and accepts what is better, or at this temperature a little worse.
+    The ``solution``, which later rounds do not change, has a ``cost`` to compare. To ``replan`` finds other paths for
+    groups, and accepts what is better, or at this temperature a little worse; ``odds`` are the robots' chances.
     """
 
-    groups: int
+    groups: int  #: Neighbourhoods that are replanned in a round
 
     @property
     def solution(self) -> S_co: ...
@@ -191,13 +177,11 @@ class _Motions:
         return self.problem.dt * resting_steps(positions).astype(float), lag
 
     def odds(self, random: np.random.Generator) -> Odds:
-        """See :meth:`LowLevelPlanner.odds`."""
         delay = np.maximum(self.arrival - self.soonest, LEAST_DELAY)
         until, nearness = np.full(len(delay), self.problem.horizon), NEARNESS * self.problem.team.largest_radius
         return Odds(delay, self.team.positions, until, nearness, (self.size, self.size))
 
     def replan(self, drawn: list[IntArray], random: np.random.Generator, temperature: float) -> None:
-        """See :meth:`LowLevelPlanner.replan`."""
         groups = np.stack(drawn)
         # Exponential, by a logarithm that is the same everywhere.
         slack = -temperature * log(1 - random.random(len(groups)))

@@ -14,12 +14,9 @@ from d4orm_env.dynamics.robot_model import SPEED, Model
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.stepping import Row
 
-_FAR = np.float32(10)
-"""Look-ahead of a robot that turns off, in seconds at full speed."""
-_BESIDE = 0.8
-"""Goal radii beside its goal to which a robot may head too: one that docks there keeps clear of a neighbour."""
-_ON_THE_SPOT = 0.001
-"""Share of its speed with which one that has a heading turns, to its goal or to one side, as if it stood."""
+_FAR = np.float32(10)  #: Look-ahead of a robot that turns off, in seconds at full speed
+_BESIDE = 0.8  #: Goal radii beside its goal to which a robot may head too: docked there it keeps clear of a neighbour
+_ON_THE_SPOT = 0.001  #: Share of its speed with which a robot with a heading turns as if it stood
 
 
 class Moves(NamedTuple):
@@ -34,8 +31,7 @@ class Moves(NamedTuple):
 class MotionPrimitives:
     """Moves of robots that look for a path."""
 
-    #: By which a robot turns off from the path to its goal [degrees]; in space up and down as well
-    angles: tuple[float, ...]
+    angles: tuple[float, ...]  #: By which a robot turns off its path to the goal [degrees]; in space up and down too
     paces: tuple[float, ...]  #: Shares of its speed with which it heads for its goal: waiting has no direction
 
     def moves(self, dimension: int, *, has_heading: bool) -> Moves:

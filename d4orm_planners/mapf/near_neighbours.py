@@ -23,9 +23,7 @@ class Cells(NamedTuple):
 
 
 def sort_into_cells(points: Floats, width: float) -> Cells:
-    """Sort points ``(N, 3)`` into cells of this width [m], or larger ones where there would be many more of them than
-    points.
-    """
+    """Sort points ``(N, 3)`` into cells of this width [m], or larger where there would be many more than points."""
     low, high = points.min(axis=0), points.max(axis=0)
     while np.floor((high - low) / width + 1).prod() > 4 * len(points) + 64:
         width *= 1.25

@@ -17,12 +17,9 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 from d4orm_planners.mapf.near_neighbours import Cells, cells_about, items_in
 
-BLOCK = 16
-"""Steps for which it is known at once whether a robot is about."""
-WIDER = 1 + 2.0**-20
-"""Factor by which distances are stretched for rounding."""
-EVER = 1 << 30
-"""Step after the last visit of a robot that stays."""
+BLOCK = 16  #: Steps for which it is known at once whether a robot is about
+WIDER = 1 + 2.0**-20  #: Factor by which distances are stretched for rounding
+EVER = 1 << 30  #: Step after the last visit of a robot that stays
 
 
 class Others(NamedTuple):
@@ -33,18 +30,14 @@ class Others(NamedTuple):
     #: itself
     need: Floats
     boxes: Floats  #: ``(B, K, 6)`` the lowest and the highest positions in every block of steps [m]
-    #: ``(K, V, 3)`` int32 nodes that each comes so near to, the first step and the one after the last
-    visits: NDArray[np.int32]
+    visits: NDArray[np.int32]  #: ``(K, V, 3)`` int32 nodes that each comes near to, first step and one after the last
     counts: IntArray  #: ``(K,)`` int64 the number of visits of each
 
 
 class Occupancy:
-    """Positions of a team, which changes robot by robot.
+    """Positions ``(T + 1, K, 3)`` of a team, float64 [m], not copied, changed robot by robot; and cells of nodes.
 
-    Args:
-        cells: The nodes.
-        positions: ``(T + 1, K, 3)`` float64 [m]; not copied.
-        flatten: What is done to positions before distances are measured; see :meth:`Team.flattened`.
+    Distances are measured between ``flatten(positions)``, see :meth:`Team.flattened`.
     """
 
     def __init__(self, cells: Cells, positions: Floats, flatten: Callable[[Floats], Floats] = np.asarray) -> None:
@@ -137,8 +130,7 @@ def note_motions(
 ) -> int:  # fmt: skip
     """Work out what :class:`Others` says of robots; the last three are output.
 
-    Returns:
-        How many of the robots are done; there is no room for the visits of the next one.
+    Returns how many of the robots are done; there is no room for the visits of the next one.
     """
     last = np.full(cells.points.shape[0], -1, np.int32)
     for number in range(robots.shape[0]):

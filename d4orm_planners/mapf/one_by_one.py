@@ -16,10 +16,8 @@ from d4orm_planners.mapf.roadmap_team import FAR, KEEP, TOUCH, Replanning, TeamR
 
 MINDED = (1.0, 0.9, 0.75, 0.5, 0.25, 0.0)
 """Shares of the others that a robot without a path minds in turn, at random: the fewer it displaces, the better."""
-RELEASED = 0.5
-"""Odds that a robot for which nothing gets better sets out late, and so lets others into a bay before it."""
-HOPELESS = 10
-"""Paths that robots do not find even alone after which patience is over."""
+RELEASED = 0.5  #: Odds that a robot for which nothing gets better sets out late, to let others into a bay before it
+HOPELESS = 10  #: Paths that robots do not find even alone after which patience is over
 
 
 def plan_one_by_one(
@@ -70,11 +68,7 @@ class _Settled:
     """A team of which some robots have paths."""
 
     def __init__(
-        self,
-        replanning: Replanning,
-        driven: TeamRollout,
-        random: np.random.Generator,
-        should_stop: Callable[[], bool],
+        self, replanning: Replanning, driven: TeamRollout, random: np.random.Generator, should_stop: Callable[[], bool]
     ) -> None:
         self.replanning, self.driven, self.random, self.should_stop = replanning, driven, random, should_stop
         self.occupancy, self.steps = (
@@ -85,7 +79,6 @@ class _Settled:
         self.leisure = 0  #: steps that robots leave others to set out, at most
 
     def replan(self, robot: int, minded: BoolArray | None = None, release: int = 0) -> bool:
-        """See :meth:`Replanning.replan_one`."""
         return self.replanning.replan_one(self.driven, self.occupancy, robot, self.steps, self.random, minded, release)
 
     def displace(self, robot: int) -> IntArray | None:

@@ -19,10 +19,8 @@ from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_planners.mapf.near_neighbours import squared_gap
 from d4orm_planners.mapf.roadmap import Roadmap, RobotArrays, passes_too_near
 
-FREE, MOVING, DONE = 0, 1, 2
-"""Robots that have not moved yet in a step; that are about to, once others have yielded; that have, or stay."""
-STAY, NOTHING = -1, -2
-"""In place of an edge: to stay at a node, and that no edge is left to try."""
+FREE, MOVING, DONE = 0, 1, 2  #: Robots not moved yet in a step; about to, once others have yielded; moved, or staying
+STAY, NOTHING = -1, -2  #: In place of an edge: to stay at a node, and that no edge is left to try
 IDLE, TIE = 1 / 3, 1 / 150
 """Detour that a robot rather makes than stay where it is, and one that is as good as none, in radii of the largest
 robot."""

@@ -23,28 +23,19 @@ from d4orm_planners.mapf.replanning import is_compiled
 from d4orm_planners.mapf.roadmap import fill_costs, lay_roadmap
 from d4orm_planners.mapf.roadmap_team import FAR, Replanning, TeamRollout, drive_moves
 
-NEARNESS = 10 / 3
-"""Random distance by which a robot may be farther away and still be replanned with another, in radii of the largest."""
-ONE_BY_ONE = (1.6, 3.0, 1.6, 3.0, 4.0)
-"""Fineness of the roadmaps of searches for paths one by one; the searches differ by chance too."""
+NEARNESS = 10 / 3  #: Random distance by which a robot may be farther and still replanned too, in largest radii
+ONE_BY_ONE = (1.6, 3.0, 1.6, 3.0, 4.0)  #: Fineness of the roadmaps of searches one by one; these differ by chance too
 ALL_AT_ONCE = (1.6, 1.25, 1.0, 2.2, 3.0)
 """Fineness of those on which paths are then looked for all at once; see
 :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
-PATIENCE = (50, 1.5)
-"""Paths, and paths for each robot, after which the next roadmap is tried if no fewer robots wait for theirs."""
-MAX_ROBOT_STEPS = 4_000_000
-"""Most steps of all robots together, whose drives are kept several times over."""
-DETOUR_RATIO = 1.25
-"""Ratio of path to straight line from which a path is a detour; on a lattice any may be 1.1 times as long."""
-LEISURELY = 10
-"""Horizon of the small problems that kernels are compiled with, in straight drives at full speed."""
+PATIENCE = (50, 1.5)  #: Paths, and paths per robot, after which the next roadmap is tried if no fewer robots wait
+MAX_ROBOT_STEPS = 4_000_000  #: Most steps of all robots together, whose drives are kept several times over
+DETOUR_RATIO = 1.25  #: Ratio of path to straight line from which it is a detour; on a lattice any may be 1.1
+LEISURELY = 10  #: Horizon of the small problems that kernels are compiled with, in straight drives at full speed
 NOT_IN_TIME = "no paths found on the roadmaps in time"
-STEPS = 3000
-"""Steps of path finding for all at once after which the next roadmap is tried."""
-RELAY_FINENESS = 1.6
-"""Fineness of the roadmap of a team with ever new goals."""
-DWELL = 1.0
-"""Time for which others keep off the goal of a robot that has arrived; by then it drives on to another [s]."""
+STEPS = 3000  #: Steps of path finding for all at once after which the next roadmap is tried
+RELAY_FINENESS = 1.6  #: Fineness of the roadmap of a team with ever new goals
+DWELL = 1.0  #: Time for which others keep off the goal of an arrived robot, which then drives on to another [s]
 
 
 @dataclass
@@ -59,7 +50,6 @@ class RoadmapPaths:
 
     @property
     def cost(self) -> tuple[int, int]:
-        """See :meth:`TeamRollout.cost`."""
         return self.solution.cost(self.replanning.problem.horizon)
 
     def odds(self, random: np.random.Generator) -> Odds:

@@ -21,19 +21,14 @@ from d4orm_planners.mapf.near_neighbours import Cells, cells_about, items_in, so
 from d4orm_planners.mapf.roadmap import Roadmap
 from d4orm_planners.tracking.path_drives import Corners, Route, Routes
 
-SPACING = 4 / 15
-"""Distance between the points of a route, at most, in radii of the largest robot, as all lengths below."""
-CUTS = (1.0, 0.5, 0.25)
-"""Shares of the allowed cut that corners are rounded by; the first that leaves room at walls."""
+SPACING = 4 / 15  #: Distance between the points of a route, at most, in radii of the largest robot, as all below
+CUTS = (1.0, 0.5, 0.25)  #: Shares of the allowed cut that corners are rounded by; the first that leaves room at walls
 ARC_POINTS, ARC_CHECKS, ARC_SLACK = 9, 17, 1 / 15
 """Points along an arc, those that are looked at for walls, and how far from those they keep beyond the margin."""
 TINY = float(np.finfo(np.float64).tiny)
-STRAIGHT, TURNING_BACK = 1e-4, 0.31
-"""Sine and cosine of half the angle by which paths turn at corners: less is no corner, and cannot be rounded."""
-WAIT_SLACK = 0.6
-"""Distance beyond radii and margin that robots under way keep."""
-SHARPEST = 2 / 3
-"""Radius below which corners are not rounded."""
+STRAIGHT, TURNING_BACK = 1e-4, 0.31  #: Sine of half the angle of no corner, cosine of one too sharp to round
+WAIT_SLACK = 0.6  #: Distance beyond radii and margin that robots under way keep
+SHARPEST = 2 / 3  #: Radius below which corners are not rounded
 
 
 def stops_of(roadmap: Roadmap, moves: IntArray, num_robots: int) -> Corners:
@@ -196,13 +191,10 @@ def _find_touched(
     cells: Cells, a: int, k: int, first: IntArray, owner: IntArray, times: Floats, radius: Floats, margin: float,
     farthest: float, passed: IntArray, wanted: IntArray, touched: IntArray,
 ) -> int:  # fmt: skip
-    """Find the robots with earlier points too near to point ``a`` of robot ``k``.
+    """Find the robots with earlier points too near to point ``a`` of robot ``k``; returns how many they are.
 
     ``touched`` lists these robots, ``wanted`` says how far each of them has to have come; those that have ``passed``
     as far already are left out. ``farthest`` is the greatest distance that may be too near [m].
-
-    Returns:
-        How many they are.
     """
     points, count = cells.points, 0
     (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, points[a], points[a], farthest)
@@ -233,10 +225,7 @@ def find_waits(
     """Find the robots that each one has to let pass; see :class:`Routes`.
 
     ``owner`` ``(T,)`` is the robot of each point, and ``waits`` ``(room, 3)`` is at which point, for whom and until it
-    has come where.
-
-    Returns:
-        How many waits there are; as many as there is room for are written.
+    has come where. Returns how many waits there are; as many as there is room for are written.
     """
     count, num_robots, farthest = 0, first.shape[0] - 1, 2.0 * radius.max() + margin
     passed = np.zeros(num_robots, np.int64)

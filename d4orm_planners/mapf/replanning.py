@@ -46,8 +46,7 @@ def _followed_back(tree: IntArray, entry: Whole) -> IntArray:
 class _Tree(NamedTuple):
     """Entries of a search so far, with room for more."""
 
-    #: ``(N, 5)`` int64 nodes, departures for them, arrivals, entries that they were come to from, intervals
-    entries: IntArray
+    entries: IntArray  #: ``(N, 5)`` int64 nodes, departures for them, arrivals, previous entries, intervals
     costs: Floats  #: ``(N,)`` steps from the start through each to the goal, at least
     heap: IntArray  #: ``(N,)`` int64 numbers of those that nothing has been tried from, the soonest at the goal first
     sizes: IntArray  #: ``(2,)`` int64 how many there are of both
@@ -66,14 +65,12 @@ def _departure(
     search: _Search, tree: IntArray, entry: Whole, head: Whole, steps: Whole, left: float, trip: Trip, dock: Whole,
     depart: Whole, turn: Whole, arrival: Whole,
 ) -> tuple[Whole, Whole, Whole]:  # fmt: skip
-    """The next departure from an entry of the tree that comes to a safe interval before all others.
+    """The next departure from an entry of the tree that comes to a safe interval before all others, its arrival and the
+    interval, -1 if there is none.
 
     The robot drives to node ``head`` in some ``steps``, from which on it takes at least the ``left`` ones to the goal.
     It departs at ``depart`` or later, loses the steps of a ``turn`` before it drives, and comes to safe interval
     ``arrival`` of the node or a later one, after step ``dock``.
-
-    Returns:
-        Departure, arrival and interval, or -1 for the interval if there is none.
     """
     safe = search.reservations.safe
     # At its start a robot may turn even where it is too near to somebody to stay.
@@ -219,13 +216,9 @@ def _grow(roadmap: Roadmap, bodies: RobotArrays, search: _Search, k: Whole, trip
 
 @register_jitable(nogil=True, **OPTIONS)
 def _with_room(tree: _Tree, room: Whole) -> _Tree:
-    """The tree, with room for so many entries more."""
     entries, costs = np.concatenate((tree.entries, np.empty((room, 5), np.int64))), np.empty(room)
     return _Tree(
-        entries,
-        np.concatenate((tree.costs, costs)),
-        np.concatenate((tree.heap, np.empty(room, np.int64))),
-        tree.sizes,
+        entries, np.concatenate((tree.costs, costs)), np.concatenate((tree.heap, np.empty(room, np.int64))), tree.sizes
     )
 
 

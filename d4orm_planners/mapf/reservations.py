@@ -35,8 +35,7 @@ class Trip(NamedTuple):
     release: Whole = 0  #: Step before which it does not set out
 
 
-TURNED_IN_DRIVING = float(np.sqrt(2.0 - 2.0 * float(FACING)))
-"""Angle, about, by which robots turn as they drive [rad]."""
+TURNED_IN_DRIVING = float(np.sqrt(2.0 - 2.0 * float(FACING)))  #: Angle, about, of turning while driving [rad]
 
 
 @compiled

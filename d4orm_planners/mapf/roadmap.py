@@ -17,22 +17,14 @@ from d4orm_env.paths.shortest_paths import in_space
 from d4orm_env.paths.spaces import Space, free_lines, make_space
 from d4orm_planners.mapf.near_neighbours import find_near, sort_into_cells, squared_gap
 
-PAIR_SLACK = 0.4
-"""Distance that robots keep from each other beyond radii and margin, in radii: what they stray from their paths."""
-WALL_SLACK = 0.15
-"""The same for obstacles, as a share of radius and margin."""
-REPLACED = 0.35
-"""Share of the step within which a start or goal takes the place of a node of the lattice."""
-MAX_NODES, MAX_COSTS = 200_000, 2**25
-"""Most nodes, and most of them times robots; lattices are coarser where there would be more."""
-NARROW_SLACK = 0.03
-"""The same as ``WALL_SLACK`` in gaps that are too narrow for it."""
-PUSHES, DAMPING = 12, 0.8
-"""Number of times a position is pushed away from obstacles, and by how much less each time, to end in the middle."""
-FINEST_IN_SPACE = 2.2
-"""Most of the fineness in space: nodes near edges become as many as its sixth power."""
-PAD = 3
-"""Steps beyond starts, goals and obstacles that nodes reach."""
+PAIR_SLACK = 0.4  #: Distance that robots keep beyond radii and margin, in radii: what they stray from their paths
+WALL_SLACK = 0.15  #: The same for obstacles, as a share of radius and margin
+REPLACED = 0.35  #: Share of the step within which a start or goal takes the place of a node of the lattice
+MAX_NODES, MAX_COSTS = 200_000, 2**25  #: Most nodes, and most of them times robots; beyond, lattices are coarser
+NARROW_SLACK = 0.03  #: The same as ``WALL_SLACK`` in gaps that are too narrow for it
+PUSHES, DAMPING = 12, 0.8  #: Times that a position is pushed from obstacles, each so much less, to the middle
+FINEST_IN_SPACE = 2.2  #: Most of the fineness in space: nodes near edges become as many as its sixth power
+PAD = 3  #: Steps beyond starts, goals and obstacles that nodes reach
 
 
 class Roadmap(NamedTuple):
@@ -156,8 +148,7 @@ def measure_gaps(
             gaps[number] = np.sqrt(squared_gap(nodes, node, nodes, tail, nodes, head))
 
 
-ROUNDING = 2.0**-27
-"""Share of the radius of the largest robot that is rounding."""
+ROUNDING = 2.0**-27  #: Share of the radius of the largest robot that is rounding
 
 
 class RobotArrays(NamedTuple):

@@ -25,28 +25,20 @@ from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
 from d4orm_planners.tracking.path_drives import Corners, drive_routes
 from d4orm_planners.tracking.timed_path import drive_by_clock
 
-FIRST_CUT = 0.2
-"""Most by which corners are cut on first routes, in radii of the largest robot, as all lengths below."""
+FIRST_CUT = 0.2  #: Most by which corners are cut on first routes, in radii of the largest robot, as all lengths below
 SPEED_PROFILES = ((1.0, 5 / 3, False), (0.9, 2 / 3, True), (0.75, 0.2, True), (0.6, 1 / 15, True))
 """Shares of its speed that a robot is taken to drive at when its path is planned, by how much it cuts corners, and
 whether the steps that it turns on the spot count; the next where it is late so, or comes too near to something."""
-LEISURE = 0.1
-"""Share of that by which it is slower, at most: drawn for every path, so that no two searches are the same."""
-LAUNCH = 0.4
-"""Share of the time to full speed that setting out costs."""
-OVERTIME = 3
-"""Horizons within which first routes must be driven; they become shorter afterwards."""
-BOUND_FACTOR, BOUND_EXTRA = 1.5, 60
-"""Bounds of the first search for a path: so many times as long as alone, and so many steps more."""
-FAR = 1e9
-"""Position of robots that are not there yet [m]."""
-LATER = 30
-"""Steps by which a robot may come later for the sake of others."""
+LEISURE = 0.1  #: Share of that by which it is slower, at most: drawn per path, so that no two searches are alike
+LAUNCH = 0.4  #: Share of the time to full speed that setting out costs
+OVERTIME = 3  #: Horizons within which first routes must be driven; they become shorter afterwards
+BOUND_FACTOR, BOUND_EXTRA = 1.5, 60  #: Bounds of the first search for a path: times as long as alone, and steps more
+FAR = 1e9  #: Position of robots that are not there yet [m]
+LATER = 30  #: Steps by which a robot may come later for the sake of others
 KEEP, TOUCH, ROUNDING = 0.4, 1 / 30, 2.0**-17
 """Distances beyond radii and margin that a path is planned to keep, where starts and goals allow it, and keeps; and
 what starts and goals themselves must be apart less, for rounding."""
-Drive: TypeAlias = tuple[FloatArray, Floats, int]
-"""Controls ``(T, m)``, positions ``(T + 1, 3)`` and step of arrival of a robot."""
+Drive: TypeAlias = tuple[FloatArray, Floats, int]  #: Controls ``(T, m)``, positions ``(T + 1, 3)``, step of arrival
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +79,7 @@ def drive_moves(problem: Problem, roadmap: Roadmap, moves: IntArray) -> TeamRoll
 class Replanning:
     """Better paths for some robots of a team at a time, planned one after another around all others as they drive.
 
-    Args:
-        problem: The team.
-        roadmap: The roadmap of its world.
-        dwell: Steps after which a robot that has arrived is no obstacle any more, for it goes on to another
-            goal; ``None`` if it stays.
-
-    Attributes:
-        alone: ``(K,)`` about how many steps each robot takes by itself.
+    After ``dwell`` steps an arrived robot is no obstacle any more, for it goes on to another goal; ``None``: it stays.
     """
 
     def __init__(self, problem: Problem, roadmap: Roadmap, dwell: int | None = None) -> None:
@@ -116,6 +101,7 @@ class Replanning:
         rooms = [problem.world.clearance(ends[:, : problem.dimension]) for ends in positions]
         self.own_room = np.minimum(*rooms) - TOUCH * self.size
         self.threads = Threads(min(2, available_cores()))
+        #: ``(K,)`` about how many steps each robot takes by itself
         self.alone = self.bodies.costs[np.arange(problem.num_robots), roadmap.starts] / self.strides
 
     def replan(
@@ -210,9 +196,7 @@ class Replanning:
             yield found[number], cut
 
     def path(self, reservations: Reservations, robot: int, trip: Trip) -> IntArray:
-        """``(n, 3)`` int64 nodes of a robot's path, and when it sets out for and comes to each; none where there is
-        none.
-        """
+        """``(n, 3)`` int64 nodes of a robot's path, and when it sets out for and reaches each; empty without one."""
         roadmap, bodies = self.roadmap, self.bodies
         # Looked for among the sooner ones at first, because that is where it mostly is.
         soon = int(BOUND_FACTOR * self.alone[robot]) + BOUND_EXTRA + trip.release

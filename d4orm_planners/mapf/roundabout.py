@@ -20,12 +20,9 @@ from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.types import Engine
 from d4orm_planners.tracking.steering import track_velocities
 
-SLACK = 1 / 75
-"""Added to the distance that robots keep from each other in it, in radii of the largest robot."""
-PARALLEL = 1e-6
-"""Paths are parallel whose directions differ by less, squared [rad^2]."""
-CORRECTION = 1.0
-"""Share of its distance from where it should be that a robot makes good in a second [1/s]."""
+SLACK = 1 / 75  #: Added to the distance that robots keep from each other in it, in radii of the largest robot
+PARALLEL = 1e-6  #: Paths are parallel whose directions differ by less, squared [rad^2]
+CORRECTION = 1.0  #: Share of its distance from where it should be that a robot makes good in a second [1/s]
 
 
 class Bends(NamedTuple):

@@ -21,10 +21,7 @@ from d4orm_env.core.problem_checks import check_resolution
 from d4orm_env.envs.lifelong import goal_region
 
 Edit = Callable[[Problem], Problem]
-
-MOST_ROBOTS, MOST_OBSTACLES = 200, 500
-"""A slip of the finger must not fill the page."""
-
+MOST_ROBOTS, MOST_OBSTACLES = 200, 500  #: A slip of the finger must not fill the page
 _ATTEMPTS = 500
 KINDS = ("circles", "spheres", "cylinders", "boxes", "polygons")
 
@@ -148,7 +145,6 @@ def followed(before: Problem, after: Problem, other: Problem, who: str) -> Probl
 
 
 def _positions(problem: Problem) -> tuple[FloatArray, FloatArray]:
-    """Copies of starts and goals."""
     return np.array(problem.start), np.array(problem.goal)
 
 
@@ -159,7 +155,6 @@ def _with_world(problem: Problem, **changes: object) -> Problem:
 
 
 def _check_world(problem: Problem) -> None:
-    """Refuse obstacles on robots and goals."""
     team, world, d = problem.team, problem.world, problem.dimension
     for what, states in (("robot", problem.start), ("goal of robot", states_at_goals(problem))):
         gap = gaps_at(team, team.body_poses(states), world)
@@ -202,9 +197,7 @@ def _free_position(
 
 P = ParamSpec("P")
 Command = Callable[[], None]
-
-MOST_WAITING = 100
-"""Commands; more than that come from no hand."""
+MOST_WAITING = 100  #: Commands; more than that come from no hand
 
 
 class CommandQueue:

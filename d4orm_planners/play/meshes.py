@@ -133,10 +133,8 @@ def bends(path: Numbers, tolerance: float) -> NDArray[np.intp]:
     return np.array(sorted(kept), np.intp)
 
 
-PLAN_TOLERANCE = 0.1
-"""Error allowed in the line of a path ahead, in radii of a robot."""
-HEIGHT, MARGIN_HEIGHT = 0.5, 0.1
-"""Of what drives in the plane, in radii of its robot."""
+PLAN_TOLERANCE = 0.1  #: Error allowed in the line of a path ahead, in radii of a robot
+HEIGHT, MARGIN_HEIGHT = 0.5, 0.1  #: Of what drives in the plane, in radii of its robot
 
 
 class BodyGroup(NamedTuple):

@@ -31,13 +31,9 @@ from websockets.http11 import Request, Response
 
 from d4orm_env.core.arrays import short_repr
 
-LARGEST_UPLOAD = 2_000_000
-"""Bytes of a file."""
-
+LARGEST_UPLOAD = 2_000_000  #: Bytes of a file
 _LARGEST_COORDINATE = 1e9
-_ROUNDING = 1e-3
-"""Share of its step by which a slider's value may be off."""
-
+_ROUNDING = 1e-3  #: Share of its step by which a slider's value may be off
 Coordinate = Annotated[float, Meta(ge=-_LARGEST_COORDINATE, le=_LARGEST_COORDINATE)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 Pixels = Annotated[float, Meta(ge=1, le=100_000)]
@@ -47,8 +43,7 @@ Name = Annotated[str, Meta(max_length=255)]
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _LOCAL_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d+)?", re.IGNORECASE)
 _LARGEST_MESSAGE = LARGEST_UPLOAD + 10_000
-_MESSAGE_PERIOD = 0.002
-"""Seconds from one message of a page to its next at least; a hand makes one every 16 ms."""
+_MESSAGE_PERIOD = 0.002  #: Seconds from one message of a page to its next at least; a hand makes one every 16 ms
 
 
 class _Message(msgspec.Struct, tag_field="type", forbid_unknown_fields=True):
@@ -109,11 +104,7 @@ _DECODER = msgspec.msgpack.Decoder(_Camera | _Drag | _Control | _Upload | _Part)
 
 
 class MessageValidator:
-    """Lets those messages of a page come through that ask for what it offers.
-
-    Args:
-        refuse: Called with the reason when a page asks for anything else.
-    """
+    """Lets those messages of a page through that ask for what it offers; ``refuse`` is told of any else, and why."""
 
     def __init__(self, server: viser.ViserServer, refuse: Callable[[str], None]) -> None:
         self._gui, self._scene, self._refuse = server.gui, server.scene, refuse
@@ -210,9 +201,7 @@ def _is_on_scale(value: object, control: Any) -> bool:
 class OriginCheck:
     """Answers requests that do not come from a page of the playground, before anything else looks at them.
 
-    Args:
-        token: Secret in the page's address; ``None`` for a page that is for browsers on this machine.
-        cookie: Name of the cookie that keeps it.
+    The secret ``token`` in the address, ``None`` for browsers on this machine, is kept by a cookie of this name.
     """
 
     def __init__(self, token: str | None, cookie: str) -> None:

@@ -72,8 +72,7 @@ SLIDERS = {
 """Sliders for what goes wrong, by name and attribute, see :mod:`~d4orm_env.disturbances.disturbance_registry`."""
 
 STATUS_EVERY = 0.2
-PUSH = 0.8
-"""Velocity that a push gives a robot [m/s]."""
+PUSH = 0.8  #: Velocity that a push gives a robot [m/s]
 
 
 class Panel:
@@ -103,7 +102,6 @@ class Panel:
             self._add_files()
 
     def update(self) -> None:
-        """Say how the team is doing."""
         now = time.perf_counter()
         if now - self._status_at < STATUS_EVERY:
             return
@@ -246,7 +244,6 @@ THEME: dict[str, Any] = {"show_logo": False, "show_share_button": False, "contro
 
 
 def status_text(frames: Sequence[Frame]) -> str:
-    """Return the page's text on a moment."""
     first, status = frames[0], frames[0].status
     team = first.problem.num_robots
     who = ", ".join(frame.policy for frame in frames)

@@ -27,26 +27,19 @@ from d4orm_planners.play.session import Session
 from d4orm_planners.play.viewport import Frame
 from d4orm_planners.play.viewport_view import ViewportView
 
-GAP = 0.12
-"""Between two scenes, in sizes of one."""
-
-
+GAP = 0.12  #: Between two scenes, in sizes of one
 FIELD_OF_VIEW = np.deg2rad(35)
-WIDE, NARROW = 1.5, 1.0
-"""Shapes of windows, width over height: a usual one, and one so narrow that the controls lie below."""
+WIDE, NARROW = 1.5, 1.0  #: Windows' width over height: a usual one, and one so narrow that the controls lie below
 Vector = NDArray[np.float64]
 
 
 class View:
-    """Shapes on the page.
-
-    Attributes:
-        shown: Which of ``"plans"``, ``"guidance"``, ``"trails"``, ``"subgoals"`` and ``"margins"`` are, and whether on
-            ``"dark"``.
-    """
+    """Shapes on the page."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server, self._session = server, session
+        #: Which of ``"plans"``, ``"guidance"``, ``"trails"``, ``"subgoals"`` and ``"margins"`` are, and whether on
+        #: ``"dark"``
         self.shown = {
             "plans": True,
             "guidance": True,
@@ -61,7 +54,6 @@ class View:
         self._looked_at: object = None
 
     def update(self) -> None:
-        """Show the present, where the robots are by now."""
         frames = self._session.frames
         built = (frames[0].status.generation, *(len(frame.bodies) for frame in frames))
         if built != self._built:
@@ -161,8 +153,7 @@ def view_from(limits: Points, dimension: int, aspect: float) -> tuple[Vector, Ve
 
 
 FRAMES_PER_SECOND = 33
-LAST_WAIT = 1.5
-"""Seconds that closing takes at most, whatever is planned or connected."""
+LAST_WAIT = 1.5  #: Seconds that closing takes at most, whatever is planned or connected
 
 
 class _Server(viser.ViserServer):
@@ -183,10 +174,6 @@ class Playground:
         port: Port of the page; 0 for any free one.
         **observation: Arguments of :class:`d4orm_env.navigation_v0.parallel_env` on what robots observe.
 
-    Attributes:
-        address: Address to open in a browser.
-        session: Session that it shows.
-
     Raises:
         ValueError: If it cannot be found there, or there is no such policy.
     """
@@ -203,7 +190,7 @@ class Playground:
         local = host in LOOPBACK
         where, chosen = LOOPBACK[0] if local else host, _free_port(host, port)
         token = None if local else secrets.token_urlsafe(24)
-        self.session = Session(problem, *policies, seed=seed, **observation)
+        self.session = Session(problem, *policies, seed=seed, **observation)  #: Session that it shows
         with (
             contextlib.redirect_stdout(io.StringIO()),  # its own words on where it is
             OriginCheck(token, f"d4orm_play_{chosen}").installed(),
@@ -213,6 +200,7 @@ class Playground:
         logging.getLogger("websockets").addHandler(logging.NullHandler())
         MessageValidator(self._server, self.session.refuse)
         named = socket.gethostname() if host in ("0.0.0.0", "::") else where
+        #: Address to open in a browser
         self.address = f"http://{named}:{self._server.get_port()}/" + ("" if local else f"?token={token}")
         self._server.scene.configure_default_lights(enabled=False)
         self._server.scene.add_light_ambient("/light", intensity=1.1)
@@ -240,7 +228,6 @@ class Playground:
         self._stopping.set()
 
     def show(self) -> None:
-        """Bring the page up to date."""
         self._view.update()
         self._panel.update()
 

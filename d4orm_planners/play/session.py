@@ -25,24 +25,14 @@ from d4orm_planners.play.edits import MOST_WAITING, CommandQueue, Edit, followed
 from d4orm_planners.play.viewport import Drivers, EpisodeOptions, Frame, Status, Viewport
 
 _IDLE = 0.1
-_MOST_EDITING = 0.25
-"""Seconds from one step to the next after which no other change is begun; the clock goes on first."""
-
+_MOST_EDITING = 0.25  #: Seconds after a step from which no other change is begun; the clock goes first
 MOST_VIEWPORTS = 6
 
 
 class Session:
-    """A team in its world, driven by a policy, or by several side by side.
+    """A team in its world, driven by ``policies``, side by side if several, under disturbances of ``levels`` by name.
 
-    Attributes:
-        commands: What was asked for by methods that wait for the next step.
-        frames: The present moment of all that drive, in their order.
-        policies: Their names.
-        levels: Disturbances, by name and level.
-        failure: Error that ended the thread, if it was not :meth:`close`.
-
-    Raises:
-        ValueError: If there is no such policy, or it cannot drive there.
+    ValueError if there is no such policy, or it cannot drive there.
     """
 
     def __init__(
@@ -51,12 +41,12 @@ class Session:
         self._loaded, self.policies = problem, policies or ("d4orm-c2f",)
         self._options, self.levels = EpisodeOptions(seed, lifelong, observation), dict[str, float]()
         self._drivers = Drivers()
-        self.commands = CommandQueue()
+        self.commands = CommandQueue()  #: What was asked for by methods that wait for the next step
         self._paused, self._steps_wanted, self._speed = False, 0, 1.0
         self._status = Status(0, 0, 0.0, 0.0, problem.dt, "planning", "", 0)
-        self.frames: tuple[Frame, ...] = ()
+        self.frames: tuple[Frame, ...] = ()  #: The present moment of all that drive, in their order
         self._viewports: tuple[Viewport, ...] = ()
-        self.failure: BaseException | None = None
+        self.failure: BaseException | None = None  #: Error that ended the thread, if it was not :meth:`close`
         self._thread = threading.Thread(target=self._live, name="d4orm-play", daemon=True)
         self._begin([problem] * len(self.policies), afresh=True)
 
@@ -84,7 +74,6 @@ class Session:
         return Replay(f"{scene.name}, {count(scene.num_robots, 'robot')} by {', '.join(self.policies)}", tuple(motions))
 
     def start(self) -> None:
-        """Let the clock run."""
         self._thread.start()
 
     def close(self) -> None:
@@ -95,7 +84,6 @@ class Session:
 
     @queued("refusal")
     def refuse(self, reason: str) -> None:
-        """Say why a request is refused."""
         raise ValueError(reason)
 
     @queued()
@@ -132,7 +120,6 @@ class Session:
 
     @queued()
     def load(self, make_scene: Callable[[], Problem], seed: int = 0) -> None:
-        """Begin anew with another scene."""
         scene = make_scene()
         self._begin([scene] * len(self.policies), options=replace(self._options, seed=seed), afresh=True)
         self._loaded = scene
@@ -164,7 +151,6 @@ class Session:
 
     @queued("lifelong")
     def set_lifelong(self, lifelong: bool) -> None:
-        """Set whether robots that arrive go on to new goals."""
         self._begin(options=replace(self._options, lifelong=lifelong))
 
     @queued("disturbances")
@@ -176,7 +162,6 @@ class Session:
 
     @queued("paused")
     def pause(self, paused: bool) -> None:
-        """Stop the clock, or let it run."""
         self._paused, self._steps_wanted = paused, 0
         self._show(self._state)
 

@@ -29,12 +29,9 @@ from d4orm_planners.base.planner_registry import make_policy, setting_names
 from d4orm_planners.base.policy import Policy
 from d4orm_planners.play.edits import check_robot
 
-MOST_STEPS = 6000
-"""Ten minutes at the usual time step; what is older is forgotten."""
-MOST_CYCLES = 10_000_000
-"""Steps of an episode that ends only when it is changed."""
-HORIZON = "predict_horizon"
-"""Setting of policies that look ahead."""
+MOST_STEPS = 6000  #: Ten minutes at the usual time step; what is older is forgotten
+MOST_CYCLES = 10_000_000  #: Steps of an episode that ends only when it is changed
+HORIZON = "predict_horizon"  #: Setting of policies that look ahead
 
 
 @dataclass(frozen=True)
@@ -105,7 +102,6 @@ class EpisodeBuffer:
             self._snapshots.append(snapshot)
 
     def motion(self, policy: str) -> ReplayMotion:
-        """Return the motion for a replay."""
         with self._lock:
             problem, snapshots = self._problem, list(self._snapshots)
         *stacked, around = zip(*snapshots, strict=True)
@@ -127,18 +123,13 @@ class EpisodeBuffer:
 
 
 class Drivers:
-    """Policies by name, made when they are first needed: some hold threads, so there is one of each.
-
-    Attributes:
-        horizon: Steps that policies which predict look ahead, if not their own number.
-    """
+    """Policies by name, made when they are first needed: some hold threads, so there is one of each."""
 
     def __init__(self) -> None:
-        self.horizon: int | None = None
+        self.horizon: int | None = None  #: Steps that policies which predict look ahead, if not their own number
         self._made = cache(make_policy)
 
     def policy(self, name: str) -> Policy:
-        """The policy of a name."""
         settings = {} if self.horizon is None or HORIZON not in setting_names(name) else {HORIZON: self.horizon}
         return self._made(name, **settings)
 
@@ -154,12 +145,7 @@ class EpisodeOptions:
 
 
 class Viewport:
-    """A policy that drives a scene.
-
-    Attributes:
-        recording: Recording up to now.
-        finished: Whether all robots have arrived.
-    """
+    """A policy that drives a scene."""
 
     def __init__(
         self, name: str, policy: Policy, scene: Problem, options: EpisodeOptions, recording: EpisodeBuffer | None = None
@@ -176,7 +162,7 @@ class Viewport:
         self.regain()
         self._replanned, self._loop = time.perf_counter() - begin, 0.0
         self._before = scene.start[:, : scene.dimension]
-        self.recording = EpisodeBuffer(scene) if recording is None else recording
+        self.recording = EpisodeBuffer(scene) if recording is None else recording  #: Recording up to now
         self._remember()
 
     def regain(self) -> None:
@@ -205,7 +191,6 @@ class Viewport:
         return self._scene.with_state(joint.states, joint.goals)
 
     def advance(self) -> None:
-        """One step of the policy and of the world."""
         if self.finished:
             return
         before = self._joint.states[:, : self._scene.dimension]
@@ -236,7 +221,6 @@ class Viewport:
         self._observations, _ = self._env.set_state(states)
 
     def frame(self, status: Status) -> Frame:
-        """Return the frame of the present."""
         joint = self._joint
         return Frame(
             status=status,

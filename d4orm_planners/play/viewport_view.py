@@ -20,28 +20,18 @@ from d4orm_planners.play.meshes import BodyGroup, PathLines, Points, in_space, l
 from d4orm_planners.play.session import Session
 from d4orm_planners.play.viewport import Frame
 
-Numbers: TypeAlias = NDArray[np.intp] | None
-"""Numbers ``(N,)`` of what shapes stand for, where they are others than the shapes' own."""
+Numbers: TypeAlias = NDArray[np.intp] | None  #: ``(N,)`` what shapes stand for, where it is not their own number
 Move: TypeAlias = Callable[[Problem, int, FloatArray, FloatArray], Problem]
 """``(scene, number, position (d,), shift (d,))`` to the scene in which something was dragged there."""
 Moved: TypeAlias = Callable[[int, Points, Points, bool], None]
 
 CONTACT, OBSTACLE, BOUND, MARGIN = (208, 2, 27), (150, 156, 166), (90, 98, 110), (200, 60, 60)
 INK, BODY = (20, 24, 30), (120, 124, 134)
-TRAIL_STEPS = 30
-"""Steps that a robot's trail goes back."""
-
-TRAIL_SEGMENTS = 8
-"""Lines that a trail consists of."""
-
-PUSH_PER_METER = 1.0
-"""Velocity that a robot gets for every metre of the arrow that pushes it [1/s]."""
-
-WIDTHS = {"guidance": 1.5, "plans": 4.0, "trails": 2.0, "goal_poses": 2.0}
-"""Widths of lines that fade, in pixels."""
-
-LINES_EVERY = 0.1
-"""Seconds between new trails and plans."""
+TRAIL_STEPS = 30  #: Steps that a robot's trail goes back
+TRAIL_SEGMENTS = 8  #: Lines that a trail consists of
+PUSH_PER_METER = 1.0  #: Velocity that a robot gets for every metre of the arrow that pushes it [1/s]
+WIDTHS = {"guidance": 1.5, "plans": 4.0, "trails": 2.0, "goal_poses": 2.0}  #: Widths of lines that fade, in pixels
+LINES_EVERY = 0.1  #: Seconds between new trails and plans
 
 
 class ViewportView:

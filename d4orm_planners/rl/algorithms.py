@@ -27,10 +27,8 @@ from d4orm_planners.rl.network import FORMAT, KINDS, SUM_SCALE, Header, Network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.task_mixture import MixedVecEnv
 
-START_COUNT = 1e6
-"""Observations that a trained network's normalisation counts for: what it knows is not forgotten."""
-WIDTHS = (64, 32)
-"""Widths of the layers that neighbours go through, and of those of obstacles."""
+START_COUNT = 1e6  #: Observations that a trained network's normalisation counts for: what it knows is not forgotten
+WIDTHS = (64, 32)  #: Widths of the layers that neighbours go through, and of those of obstacles
 
 
 class _Set(nn.Module):
@@ -79,8 +77,7 @@ class SetExtractor(BaseFeaturesExtractor):
         return named
 
 
-SHARES = ("tau", "gae_lambda")
-"""Settings that are at most 1."""
+SHARES = ("tau", "gae_lambda")  #: Settings that are at most 1
 
 
 class Algorithm:
@@ -94,8 +91,7 @@ class Algorithm:
     learning_rate: ClassVar[float] = 3e-4  #: At the beginning; it falls linearly to a tenth
     gamma: ClassVar[float] = 0.99  #: Discount per step
     network: ClassVar[Mapping[str, object]] = MappingProxyType({})  #: Further keywords of its networks
-    #: Further keywords of Stable-Baselines3 that a training may set otherwise, with their values here
-    tunable: ClassVar[Mapping[str, float]]
+    tunable: ClassVar[Mapping[str, float]]  #: More keywords of SB3 that a training may set, with values here
 
     def make(self, env: VecNormalize, sets: Features | None, tuned: Mapping[str, float]) -> BaseAlgorithm:
         """A new model, whose first weights are drawn from the global random state."""
@@ -171,8 +167,7 @@ class _SAC(Algorithm):
         return {"ent_coef": entropy, "learning_starts": 50 * env.num_envs, "train_freq": self.steps_per_update}
 
 
-ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType({"ppo": _PPO(), "sac": _SAC()})
-"""Algorithms by the names of their policies."""
+ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType({"ppo": _PPO(), "sac": _SAC()})  #: By their policies' names
 
 
 def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: VecNormalize) -> Network:
@@ -232,7 +227,6 @@ def set_network(model: BaseAlgorithm, normalization: VecNormalize, network: Netw
 
 
 def _seen(normalization: VecNormalize) -> RunningMeanStd:
-    """Mean and variance of the features, which are one array."""
     assert not isinstance(normalization.obs_rms, dict)
     return normalization.obs_rms
 

@@ -46,13 +46,11 @@ class Evaluation:
     success_rate: float  #: Share of the validation episodes in which all arrived and none ever touched anything
     travel_time: float  #: Their mean arrival time [s], with the whole episode for robots that did not arrive
     seconds: float  #: Time that the stage took
-    #: Share of it that went into the environments, instances that are drawn included; in an imitation, into recording
-    env_share: float
+    env_share: float  #: Share of it in the environments, drawing instances included; in an imitation, in recording
     #: Root mean square of the actions less those of the expert, in units of the limits, in episodes that were not
     #: learned from; ``None`` without an expert
     imitation_error: float | None = None
-    #: Success rates of the parts of a mixture, in their order, of which ``success_rate`` is the mean
-    parts: Sequence[float] | None = None
+    parts: Sequence[float] | None = None  #: Success rates of a mixture's parts; ``success_rate`` is their mean
 
     @property
     def rank(self) -> tuple[float, float]:
@@ -82,7 +80,6 @@ def run_worlds(network: Network, worlds: RobotVecEnv, seed: int) -> list[tuple[b
 
 
 def write_curve(folder: Path, evaluations: Sequence[Evaluation]) -> None:
-    """Write ``curve.csv`` and ``curve.png``."""
     write_csv(folder / "curve.csv", [vars(evaluation) for evaluation in evaluations])
     with replaced_when_done(folder / "curve.png") as temporary:
         _draw(temporary, evaluations)
@@ -108,12 +105,7 @@ _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "
 
 
 class Checkpoints:
-    """The checkpoints in a training's folder.
-
-    Raises:
-        ValueError: If the folder holds a training with other settings.
-        OSError: If it cannot be used.
-    """
+    """The checkpoints in a training's folder; ValueError if that has other settings, OSError if it cannot be used."""
 
     def __init__(self, out: Path, settings: Mapping[str, object]) -> None:
         self.policy_path = out / f"policy{SUFFIX}"
@@ -123,7 +115,6 @@ class Checkpoints:
         claim_folder(out / "settings.json", settings, "a training", remedy)
 
     def policy(self) -> Network:
-        """The policy that did best so far."""
         return load_network(self.policy_path)
 
     def conclude(
@@ -152,7 +143,6 @@ class Checkpoints:
         return Checkpoint.read(final)
 
     def latest(self) -> Checkpoint | None:
-        """The last complete checkpoint."""
         complete = self._complete()
         return Checkpoint.read(complete[-1]) if complete else None
 
@@ -178,9 +168,7 @@ class Checkpoint:
             return cls(folder, evaluations)
 
     def restore(self, env: VecNormalize, model: BaseAlgorithm, fresh: bool) -> None:
-        """Put a new environment, and the model if it is fresh, into the checkpoint's state; ValueError if that cannot
-        be.
-        """
+        """Put a new environment, and a fresh model, into the checkpoint's state; ValueError if that cannot be."""
         with _readable(self.folder):
             numbers = self._numbers(model, env, fresh)
         for name, running in _running(env).items():
@@ -223,7 +211,6 @@ class Checkpoint:
 
 
 def _running(env: VecNormalize) -> dict[str, Any]:
-    """The running statistics by name."""
     return {"observation": env.obs_rms, "reward": env.ret_rms}
 
 

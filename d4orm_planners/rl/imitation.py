@@ -16,10 +16,11 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pettingzoo import ParallelEnv
 from pydantic import Field
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
@@ -31,26 +32,20 @@ from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_planners.base.planner_registry import make_policy, setting_names
 from d4orm_planners.base.policy import Policy, robot_indices
 from d4orm_planners.base.settings import Count, PathText
+from d4orm_planners.evaluation.pool import only_writer
 from d4orm_planners.rl.algorithms import ALGORITHMS, network_of
 from d4orm_planners.rl.checkpoints import Checkpoints, Evaluation, evaluate_network
 from d4orm_planners.rl.dataset.minari_files import Samples, dataset_samples
 from d4orm_planners.rl.network import CLIP, EPSILON, Network
-from d4orm_planners.rl.only_writer import only_writer
 from d4orm_planners.rl.task_mixture import Instances
 from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, TrainConfig
 from d4orm_planners.rl.training import Progress, TrainingResult
 
-if TYPE_CHECKING:
-    from pettingzoo import ParallelEnv
-
 __all__ = ["ImitationSettings", "imitate"]
 
 Driver = Callable[[FloatArray, FloatArray], FloatArray]
-
-LEARNER = "ppo"
-"""Algorithm whose network learns, and whose policy it is then."""
-HELD_OUT = 10
-"""One in so many episodes is not learned from but tells the imitation error."""
+LEARNER = "ppo"  #: Algorithm whose network learns, and whose policy it is then
+HELD_OUT = 10  #: One in so many episodes is not learned from but tells the imitation error
 
 OTHERS_DRIVE: Mapping[str, object] = MappingProxyType(
     {"delay": 0, "filter_states": False, "learn_limits": False, "stalls": False, "reaction_time": 0.0, "refine": "sync"}
@@ -58,36 +53,29 @@ OTHERS_DRIVE: Mapping[str, object] = MappingProxyType(
 """Settings of an expert that has them: it is asked while another drives, and must not conclude from what robots do that
 they are late, weak, noisy or stalled."""
 
-
 BATCH = 128
-LEARNING_RATE = 1e-3
-"""At the beginning of a round; it falls linearly to nothing."""
+LEARNING_RATE = 1e-3  #: At the beginning of a round; it falls linearly to nothing
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImitationSettings(TrainConfig):
     """Settings of imitation: the expert, and how long.
 
-    Attributes:
-        expert: A planner or policy by name or import path. A planner's plan is executed open loop, which tells nothing
-            of what to do elsewhere: with one, leave it at one round.
-        expert_settings: Its settings, over :data:`OTHERS_DRIVE`.
-        dataset: Folder or name of a dataset of ``d4orm dataset`` that stands for the first round's episodes; ``None``
-            has them recorded.
-        episodes: To record in each round. Every other one is of ``random`` where another scenario is to be learned.
-        rounds: The first clones the expert, the others are DAgger's.
-        epochs: Of each round.
-
     Raises:
         TypeError: For a setting that the expert does not have.
     """
 
+    #: A planner or policy by name or import path. A planner's plan is executed open loop, which tells nothing of what
+    #: to do elsewhere: with one, leave it at one round
     expert: str = "d4orm-c2f"
-    expert_settings: Mapping[str, object] = field(default_factory=dict)
+    expert_settings: Mapping[str, object] = field(default_factory=dict)  #: Its settings, over :data:`OTHERS_DRIVE`
+    #: Folder or name of a dataset of ``d4orm dataset`` that stands for the first round's episodes; ``None`` has them
+    #: recorded
     dataset: PathText | None = None
+    #: To record in each round. Every other one is of ``random`` where another scenario is to be learned
     episodes: Annotated[Many, Field(ge=2)] = 100
-    rounds: Annotated[Count, Field(le=1000)] = 5
-    epochs: Annotated[Count, Field(le=100_000)] = 20
+    rounds: Annotated[Count, Field(le=1000)] = 5  #: The first clones the expert, the others are DAgger's
+    epochs: Annotated[Count, Field(le=100_000)] = 20  #: Of each round
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -145,7 +133,6 @@ class _ImitationRun:
             checkpoint.restore(self._env, self._model, fresh=True)
 
     def learn(self, index: int) -> None:
-        """One round, its evaluation and its checkpoint."""
         begin, settings = time.perf_counter(), self.settings
         each, drivers = settings.episodes + settings.epochs, ("cloning", "DAgger")
         success = f"; success {self.evaluations[-1].success_rate:.0%}" if self.evaluations else ""
@@ -173,7 +160,6 @@ class _ImitationRun:
     def _conclude(
         self, index: int, steps: int, held: tuple[FloatArray, FloatArray], seconds: float, recorded: float
     ) -> None:
-        """Judge what has been learned, and keep it."""
         network, (inputs, targets) = self._network(index, seconds), held
         error = float(np.sqrt(np.mean((network(inputs) - targets) ** 2)))
         outcome = evaluate_network(network, self._validation, VALIDATION_SEED)

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from d4orm_env.core.world import World
 
 SHIPPED = Path(__file__).parent / "policies"
-SEEN_OBSTACLES = 4
-"""Obstacles that the policies that come with the package see."""
+SEEN_OBSTACLES = 4  #: Obstacles that the policies that come with the package see
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,9 +224,7 @@ class Detours:
         self._alone: dict[int, Problem] = {}
 
     def goals(self, joint: JointState, positions: FloatArray) -> FloatArray:
-        """``(K, d)`` where robots at ``positions`` ``(K, d)`` should head [m]: their goals, or along their paths where
-        an arrived robot is in the way.
-        """
+        """``(K, d)`` where robots at ``positions`` ``(K, d)`` head [m]: to goals, or by paths round arrived ones."""
         if (joint.arrived != self._arrived).any():
             self._arrived, self._alone, world = joint.arrived, {}, self._problem.world
             balls = np.column_stack([joint.states[self._arrived, : world.dimension], self._radius[self._arrived]])
@@ -256,7 +253,6 @@ class Detours:
 
 
 def _load_zip(algorithm: str, path: Path) -> Any:
-    """A model of Stable-Baselines3."""
     try:
         import stable_baselines3
     except ImportError:

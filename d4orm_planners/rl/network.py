@@ -25,17 +25,12 @@ FORMAT = 1
 EPSILON = 0.1
 """Added to variances. Features are of order one; what was never seen to vary, as a fourth neighbour in teams of four,
 must not be blown up when it does."""
-CLIP = 10.0
-"""Bound of normalised features."""
+CLIP = 10.0  #: Bound of normalised features
 MAX_BYTES = 64 * 2**20
 SUFFIX = ".safetensors"
 _ACTIVATIONS: Mapping[str, Callable[[FloatArray], FloatArray]] = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, 0)}
-
-
-KINDS = ("neighbor", "obstacle")
-"""Kinds of sets, in the order in which features have them."""
-SUM_SCALE = 0.25
-"""Scale of sums, which keeps those of a few of order one."""
+KINDS = ("neighbor", "obstacle")  #: Kinds of sets, in the order in which features have them
+SUM_SCALE = 0.25  #: Scale of sums, which keeps those of a few of order one
 
 
 class Header(BaseModel):
@@ -54,16 +49,14 @@ class Header(BaseModel):
     activation: str  #: Between the layers
     squashed: bool  #: Whether the output goes through tanh
     layers: int = Field(ge=1, le=16)  #: Number of layers; those of sets come before them and are not counted
-    #: Whether it reads goal headings; ``None`` is not, and it acts as if there were none
-    goal_headings: Literal[True] | None = None
+    goal_headings: Literal[True] | None = None  #: Whether it reads goal headings; ``None`` acts as if there were none
     #: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.network`. Such a policy
     #: acts for any number of observed robots
     encoder: Literal["sets"] | None = None
     frame: Literal["heading"] | None = None  #: Direction of the first axis of a robot's frame; ``None`` is to the goal
     #: Whether it heads along the shortest paths, see :meth:`Features.along`; ``None`` is straight
     shortest_paths: Literal[True] | None = None
-    #: Whether it has learned to slow down for its goals; ``None`` is not, and go-to-goal brakes for it
-    brakes: Literal[True] | None = None
+    brakes: Literal[True] | None = None  #: Whether it has learned to brake; ``None`` has go-to-goal brake for it
     training: dict[str, object]  #: The command and its settings, for people, and the ``training_time`` [s]
 
     @property
@@ -101,7 +94,6 @@ class Network:
 
     @property
     def features(self) -> Features:
-        """Features that it sees."""
         head = self.header
         sizes, turns = (head.dimension, head.num_neighbors, head.num_obstacles), bool(head.goal_headings)
         slices = ObservationSlices(*sizes, num_rays=head.num_rays or 0, goal_headings=turns)
@@ -147,7 +139,6 @@ class Network:
         return np.clip((features - mean) / np.sqrt(variance + EPSILON), -CLIP, CLIP)
 
     def save(self, path: str | Path) -> None:
-        """Write a policy file, whose name ends in ``.safetensors``."""
         with replaced_when_done(checked_path(path, "a network"), (SUFFIX,)) as temporary:
             # As bytes, because the library's own files are for the owner's eyes only.
             temporary.write_bytes(save(dict(self.arrays), metadata={"d4orm": self.header.text()}))
@@ -196,7 +187,6 @@ def _header(path: Path, text: str) -> Header:
 
 
 def _checked(path: Path, header: Header, arrays: dict[str, np.ndarray]) -> dict[str, FloatArray]:
-    """The arrays, if they are those of the header's network."""
     features = Network(header, {}).features
     width: int | None
     shapes: dict[str, tuple[int | None, ...]] = {"reward_variance": ()}

@@ -12,8 +12,7 @@ from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 
 _TRIES = 200
-_ROOM = 1.1
-"""Over the least distance between the centres of two robots that keeps the margin."""
+_ROOM = 1.1  #: Over the least distance between the centres of two robots that keeps the margin
 
 
 def perturbed(

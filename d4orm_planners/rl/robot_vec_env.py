@@ -24,16 +24,11 @@ from d4orm_env.scenarios.problems import ScenarioLike
 
 
 class SharedVecEnv(VecEnv):
-    """Base of environments whose robots share their worlds, so that none can be had by itself.
-
-    Attributes:
-        parts: Environments that it consists of, which are itself where it is one.
-        seconds: Time spent so far on stepping and on what episodes begin with, such as drawing instances.
-    """
+    """Base of environments whose robots share their worlds, so that none can be had by itself."""
 
     render_mode = None
-    parts: Sequence[RobotVecEnv]
-    seconds = 0.0
+    parts: Sequence[RobotVecEnv]  #: Environments that it consists of, which are itself where it is one
+    seconds = 0.0  #: Time spent so far on stepping and on what episodes begin with, such as drawing instances
 
     def reset(self) -> FloatArray:
         """Begin an episode in every world; the seed counts once."""
@@ -109,10 +104,6 @@ class RobotVecEnv(SharedVecEnv):
         **kwargs: Further arguments of :class:`d4orm_env.envs.vector_env.NavigationVectorEnv`.
 
     Attributes:
-        shortest_paths: As above.
-        acted: ``(B * K,)`` bool: which robots acted in the last step.
-        finished: ``(world, success, travel_time)`` of the worlds that ended in the last step.
-        limits: ``(B * K, m)`` largest controls.
         frames: ``(B * K, 2)`` in which the robots act now, see :meth:`Features.encode`.
 
     Raises:
@@ -150,10 +141,10 @@ class RobotVecEnv(SharedVecEnv):
             [max_observed] * num_worlds if max_observed is None or isinstance(max_observed, int) else max_observed
         )
         count = num_worlds * problem.num_robots
-        self.limits = np.tile(problem.team.control_limits, (num_worlds, 1))
+        self.limits = np.tile(problem.team.control_limits, (num_worlds, 1))  #: ``(B * K, m)`` largest controls
         self._seed: int | None = seed
-        self.acted = np.ones(count, np.bool_)
-        self.finished: list[tuple[int, bool, float]] = []
+        self.acted = np.ones(count, np.bool_)  #: ``(B * K,)`` bool: which robots acted in the last step
+        self.finished: list[tuple[int, bool, float]] = []  #: ``(world, success, travel_time)`` of worlds just ended
         self.parts = (self,)
         bound = np.full(self.features.size, 10, np.float32)
         m = problem.control_size
@@ -265,13 +256,11 @@ class RobotVecEnv(SharedVecEnv):
         self._env.close()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the worlds at the next reset."""
         self._seed = seed
         return [seed] * self.num_envs
 
 
 def _check_learnable(problem: Problem) -> None:
-    """Refuse teams that no policy is learned for."""
     if not problem.docks:
         raise ValueError("arrival is 'stay', and one robot's episode ends where it docks; train with arrival='dock'")
     if len(models := set(problem.team.models)) > 1:

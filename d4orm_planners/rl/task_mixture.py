@@ -106,7 +106,6 @@ class TrainTask:
         return problem if said else problem.replace(goal_speed=np.inf)
 
     def draws(self, model: str | None = None) -> bool:
-        """Check whether its instances differ."""
         return find_scenario(self.scenario).draws or self.problem(0, model) != self.problem(1, model)
 
     def worlds(
@@ -117,9 +116,7 @@ class TrainTask:
         model: str | None = None,
         **options: Any,
     ) -> RobotVecEnv:
-        """Worlds to train in, each with a value of ``max_observed``, the first with this seed, and ``instances`` to
-        choose among.
-        """
+        """Worlds to train in, one per value of ``max_observed``, from this seed on, with ``instances`` to draw."""
         if self.disturbances:
             options["disturbances"] = disturbances_at(self.disturbances)
         return RobotVecEnv(
@@ -135,13 +132,7 @@ class TrainTask:
 
 
 class Instances:
-    """A scenario whose instances are kept when they have been drawn.
-
-    Args:
-        draw: ``seed -> Problem``.
-        seeds: Of the instances there are; ``None`` is all.
-        drawn: Instances by their seeds, to which others are added.
-    """
+    """A scenario ``seed -> Problem`` of these seeds, or all (``None``), whose instances are kept in ``drawn``."""
 
     def __init__(self, draw: Callable[[int], Problem], seeds: Sequence[int] | None, drawn: dict[int, Problem]) -> None:
         self._draw, self._seeds, self._drawn = draw, seeds, drawn
@@ -172,11 +163,7 @@ def gather_parts(tasks: Sequence[TrainTask], counts: Sequence[int]) -> list[tupl
 
 
 class MixedVecEnv(SharedVecEnv):
-    """The robots of several :class:`RobotVecEnv` as one, in order; all else as there, worlds counted through.
-
-    Raises:
-        ValueError: If the parts do not go together.
-    """
+    """The robots of several :class:`RobotVecEnv`, worlds counted through; ValueError if these do not go together."""
 
     def __init__(self, parts: Sequence[RobotVecEnv]) -> None:
         first, self.parts = parts[0], tuple(parts)
@@ -201,5 +188,4 @@ class MixedVecEnv(SharedVecEnv):
             part.close()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the worlds of every part at the next reset, alike."""
         return [seed for part in self.parts for seed in part.seed(seed)]

@@ -20,49 +20,31 @@ from d4orm_planners.rl.algorithms import ALGORITHMS
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.task_mixture import Instances, MixedVecEnv, TrainTask, gather_parts, parse_mixture
 
-VALIDATION_SEED = 0
-"""Worlds are seeded one by one from here in validation, and in training from numbers of 64 random bits."""
-
-Many = Annotated[Count, Field(le=100_000)]
-"""Robots, worlds or episodes at once: beyond, their observations would fill the memory."""
+VALIDATION_SEED = 0  #: Worlds are seeded from here in validation, and in training from numbers of 64 random bits
+Many = Annotated[Count, Field(le=100_000)]  #: Robots, worlds or episodes at once: more would fill the memory
 Seed = Annotated[Whole, Field(ge=0)]
-MOST_OBSERVED = 1000
-"""Robots, or rays, in an observation at most."""
-
-
+MOST_OBSERVED = 1000  #: Robots, or rays, in an observation at most
 _INSTANCES, _STEPS_PER_INSTANCE = 256, 25_000
 """At most so many of each part are chosen among. All are new in each stage, but where robots look along paths, which
 take long to find: there one is new for so many robot-steps."""
-Drawn = dict[tuple[int, str, int], dict[int, Problem]]
-"""Instances by part, scenario and team size, and by their seeds."""
+Drawn = dict[tuple[int, str, int], dict[int, Problem]]  #: Instances by part, scenario and team size, and seed
 NETWORKS = ("flat", "sets")
-MIXTURE = "mixture"
-"""Stands for the scenario of stages that are about several."""
+MIXTURE = "mixture"  #: Stands for the scenario of stages that are about several
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig(CheckedSettings):
-    """Common settings of all trainings.
+    """Common settings of all trainings."""
 
-    Attributes:
-        scenario: Scenario to learn. Instances of ``random`` are trained on along with any other scenario.
-        num_robots: Size of the full team.
-        seed: Of everything that is drawn.
-        model: Robot model; ``None`` is the scenario's own.
-        validation_worlds: Episodes per evaluation.
-        observed_rays: Rays of every robot's range sensor, see :class:`~d4orm_env.envs.options.EnvOptions`.
-        ray_range: Range of that [m].
-        scenario_settings: Arguments of the scenario.
-    """
-
-    scenario: str = "random"
-    num_robots: Many = 4
-    seed: Seed = 0
-    model: str | None = None
-    validation_worlds: Many = 100
+    scenario: str = "random"  #: Scenario to learn. Instances of ``random`` are trained on along with any other scenario
+    num_robots: Many = 4  #: Size of the full team
+    seed: Seed = 0  #: Of everything that is drawn
+    model: str | None = None  #: Robot model; ``None`` is the scenario's own
+    validation_worlds: Many = 100  #: Episodes per evaluation
+    #: Rays of every robot's range sensor, see :class:`~d4orm_env.envs.options.EnvOptions`
     observed_rays: Annotated[Whole, Field(ge=0, le=MOST_OBSERVED)] = 0
-    ray_range: Positive = 5.0
-    scenario_settings: Mapping[str, object] = field(default_factory=dict)
+    ray_range: Positive = 5.0  #: Range of that [m]
+    scenario_settings: Mapping[str, object] = field(default_factory=dict)  #: Arguments of the scenario
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -161,43 +143,32 @@ def make_stages(num_robots: int, scenario: str, steps: int, unit: int, count: in
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingSettings(TrainConfig):
-    """Settings of a training.
+    """Settings of a training."""
 
-    Attributes:
-        algorithm: ``"ppo"`` or ``"sac"``.
-        steps: Robot-steps, rounded up to whole updates.
-        num_envs: Robots that act at once; ``None`` is the algorithm's own number.
-        curriculum: Whether smaller teams come first.
-        stages: Parts of the training, each with a checkpoint and an evaluation at its end.
-        start_from: A policy file of the same algorithm, whose network learns on; ``None`` begins with nothing.
-        network: ``"flat"``, fully connected from all that is observed; or ``"sets"``, which pools neighbours and
-            obstacles, see :mod:`d4orm_planners.rl.network`.
-        observed_robots: In observations.
-        shortest_paths: Whether robots see their goals along their shortest paths, as is wanted among walls, see
-            :meth:`~d4orm_env.envs.features.Features.along`.
-        learning_rate: At the beginning; ``None`` is the algorithm's own. It falls linearly to a tenth.
-        learner_settings: Further settings of the algorithm, as Stable-Baselines3 calls them, where they are others than
-            those of :mod:`d4orm_planners.rl.algorithms`: ``{"gradient_steps": 8}``.
-        reward_settings: Weights of the :class:`~d4orm_env.envs.rewards.TrainingReward` to learn from, where they are
-            others.
-        mixture: Scenarios and team sizes to be trained on all at once, in place of ``scenario`` and ``num_robots``:
-            texts as :meth:`~d4orm_planners.rl.task_mixture.TrainTask.parse` takes them, or names of
-            :data:`~d4orm_planners.rl.task_mixture.MIXTURES`. Each has as many robots, as nearly as whole worlds allow,
-            and as many validation worlds as any other.
-    """
-
-    algorithm: Annotated[str, one_of(ALGORITHMS)] = "ppo"
-    steps: Annotated[Count, Field(le=10**15)] = 5_000_000
-    num_envs: Many | None = None
-    curriculum: bool = False
-    stages: Annotated[Count, Field(le=1000)] = 50
-    start_from: PathText | None = None
+    algorithm: Annotated[str, one_of(ALGORITHMS)] = "ppo"  #: ``"ppo"`` or ``"sac"``
+    steps: Annotated[Count, Field(le=10**15)] = 5_000_000  #: Robot-steps, rounded up to whole updates
+    num_envs: Many | None = None  #: Robots that act at once; ``None`` is the algorithm's own number
+    curriculum: bool = False  #: Whether smaller teams come first
+    stages: Annotated[Count, Field(le=1000)] = 50  #: Parts of the training; a checkpoint and an evaluation ends each
+    start_from: PathText | None = None  #: Policy file of the same algorithm that learns on; ``None`` begins anew
+    #: ``"flat"``, fully connected from all that is observed; or ``"sets"``, which pools neighbours and obstacles, see
+    #: :mod:`d4orm_planners.rl.network`
     network: Annotated[str, one_of(NETWORKS)] = "flat"
-    observed_robots: Annotated[Whole, Field(ge=0, le=MOST_OBSERVED)] = 4
+    observed_robots: Annotated[Whole, Field(ge=0, le=MOST_OBSERVED)] = 4  #: In observations
+    #: Whether robots see their goals along their shortest paths, as is wanted among walls, see
+    #: :meth:`~d4orm_env.envs.features.Features.along`
     shortest_paths: bool = False
+    #: At the beginning; ``None`` is the algorithm's own. It falls linearly to a tenth
     learning_rate: Annotated[Positive, Field(le=1)] | None = None
+    #: Further settings of the algorithm, as Stable-Baselines3 calls them, where they are others than those of
+    #: :mod:`d4orm_planners.rl.algorithms`: ``{"gradient_steps": 8}``
     learner_settings: Mapping[str, Number] = field(default_factory=dict)
+    #: Weights of the :class:`~d4orm_env.envs.rewards.TrainingReward` to learn from, where they are others
     reward_settings: Mapping[str, Number] = field(default_factory=dict)
+    #: Scenarios and team sizes to be trained on all at once, in place of ``scenario`` and ``num_robots``: texts as
+    #: :meth:`~d4orm_planners.rl.task_mixture.TrainTask.parse` takes them, or names of
+    #: :data:`~d4orm_planners.rl.task_mixture.MIXTURES`. Each has as many robots, as nearly as whole worlds allow, and
+    #: as many validation worlds as any other
     mixture: Annotated[
         tuple[str, ...], BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
     ] = ()
@@ -220,7 +191,6 @@ class TrainingSettings(TrainConfig):
 
     @cached_property
     def tasks(self) -> tuple[TrainTask, ...]:
-        """The parts of the mixture."""
         return parse_mixture(self.mixture)
 
     @cached_property
@@ -231,12 +201,10 @@ class TrainingSettings(TrainConfig):
 
     @property
     def reward(self) -> TrainingReward:
-        """Reward to learn from."""
         return TrainingReward(**self.reward_settings)
 
     @property
     def worlds_per_task(self) -> tuple[int, ...]:
-        """Number of worlds of each part of the mixture."""
         share = (self.num_envs or ALGORITHMS[self.algorithm].num_envs) / max(len(self.tasks), 1)
         return tuple(max(round(share / task.num_robots), 1) for task in self.tasks)
 
@@ -258,14 +226,9 @@ class TrainingSettings(TrainConfig):
     def worlds(
         self, stage: Stage, number: int = 0, done: int = 0, drawn: Drawn | None = None
     ) -> RobotVecEnv | MixedVecEnv:
-        """Worlds for a stage.
+        """Worlds for the stage with this number, after so many robot-steps ``done``.
 
-        Args:
-            stage: Stage of the training.
-            number: Of the stage.
-            done: Robot-steps in the stages before.
-            drawn: Instances of earlier stages, from which those that are used again are taken; others are left out,
-                and new ones added when they are drawn.
+        Instances of earlier stages that are used again are taken from ``drawn``; others are left out, new ones added.
         """
         seed, drawn, parts = derived_seed(self.seed, Stream.TRAINING_WORLDS, number), {} if drawn is None else drawn, []
         options = {**self.options, "goal_headings": self.goal_headings}

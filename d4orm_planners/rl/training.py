@@ -23,10 +23,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env.core.files import checked_path
 from d4orm_env.core.seeds import Stream, derived_seed
+from d4orm_planners.evaluation.pool import only_writer
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm, network_of, set_network
 from d4orm_planners.rl.checkpoints import Checkpoints, Evaluation, evaluate_network
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network, range_sensors
-from d4orm_planners.rl.only_writer import only_writer
 from d4orm_planners.rl.train_config import MIXTURE, VALIDATION_SEED, Drawn, Stage, TrainingSettings, make_stages
 
 __all__ = ["TrainingResult", "TrainingSettings", "train"]
@@ -92,7 +92,6 @@ class _TrainingRun:
         self.evaluations: list[Evaluation] = [] if self._checkpoint is None else self._checkpoint.evaluations
 
     def _first_network(self, path: str) -> Network:
-        """A policy that learns on."""
         network, wanted = load_network(path), self._validation.features.frame
         if network.features.frame != wanted:
             raise ValueError(
@@ -121,7 +120,6 @@ class _TrainingRun:
         return network
 
     def learn(self, index: int) -> None:
-        """One stage, its evaluation and its checkpoint."""
         begin, stage, settings = time.perf_counter(), self.stages[index], self.settings
         done = sum(earlier.steps for earlier in self.stages[:index])
         self._progress(_describe(stage, self.evaluations), done, self._total)

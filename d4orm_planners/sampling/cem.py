@@ -20,18 +20,13 @@ from d4orm_planners.sampling.weights import Array, EliteWeights
 
 @dataclass(frozen=True, kw_only=True)
 class CEMConfig(ContinuationSettings, SamplingConfig):
-    """Settings of the cross-entropy method.
-
-    Raises:
-        ValueError: If variance is to be carried over that is not adapted.
-    """
+    """Settings of the cross-entropy method; ValueError if variance is to be carried over that is not adapted."""
 
     elite_fraction: Share = 0.05  #: Share of samples that are averaged
     sigma: Positive = 1.0  #: Standard deviation of the samples of an iteration's first step
     adapt_variance: bool = False  #: Let the variance follow that of the elite, as the method is usually written
     sigma_floor: Positive = 0.05  #: Smallest standard deviation that the adaptation may reach
-    #: Whether an iteration begins with the last one's variance, as in the authors' published code
-    carry_variance: bool = False
+    carry_variance: bool = False  #: An iteration begins with the last one's variance, as in the authors' published code
 
     def __post_init__(self) -> None:
         super().__post_init__()

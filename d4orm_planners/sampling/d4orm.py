@@ -37,8 +37,7 @@ class DeformationConfig(ContinuationSettings, DenoisingConfig):
     penalty: Positive = 2.0  #: 2 by default, for the two that touch
     #: True by default: with the default's credit that solves slightly sooner. The paper clips in the rollout only.
     clip_between_iterations: bool = True
-    #: Share of the steps, the last ones, at which the noise is small enough for fewer samples
-    late_steps: ShareOrNone = 0.7
+    late_steps: ShareOrNone = 0.7  #: Share of the steps, the last, with so little noise that fewer samples do
     late_samples: Share = 0.5  #: Share of the samples that these steps draw
     #: Start every deformation from ``U_N ~ N(0, I)``, as Algorithm 1 is written, rather than from zero. The code that
     #: the paper's authors published starts from zero, and so does the preset: it solves more.

@@ -13,9 +13,7 @@ from d4orm_env.render.replay import Denoising
 from d4orm_planners.engine.sampling_types import DenoisingStep
 
 __all__ = ["DenoisingFilm"]
-
-POINTS = 26
-"""Points of a path that are kept."""
+POINTS = 26  #: Points of a path that are kept
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,6 @@ class DenoisingFilm:
         self._frames: list[_Frame] = []
 
     def __call__(self, step: DenoisingStep) -> None:
-        """Remember a step."""
         # That of a part of the team has a team of its own.
         if step.task.problem.team is not self._problem.team:
             return

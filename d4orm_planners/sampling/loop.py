@@ -28,10 +28,8 @@ from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
 from d4orm_planners.sampling.settings import DenoisingConfig, SamplingConfig, alpha_bar
 from d4orm_planners.sampling.weights import GroupWeights
 
-SHORT = 5.0
-"""Length below which paths are short, in distances that two robots keep between their centres."""
-SLACK, SLACK_GROWTH = 2.0, 0.2
-"""Horizon of the samples at first, in times of the drive, and its growth with every iteration."""
+SHORT = 5.0  #: Length below which paths are short, in distances that two robots keep between their centres
+SLACK, SLACK_GROWTH = 2.0, 0.2  #: First horizon of the samples, in times of the drive, and its growth per iteration
 
 
 def on_short_paths(task: SamplingTask, search: SolveRun) -> SamplingTask:
@@ -99,7 +97,6 @@ class SamplingPlanner(Planner):
         """``(base, mean)``, each ``(H, K, m)``: samples are drawn around ``mean`` on top of ``base``."""
 
     def task(self, search: SolveRun, base: FloatArray) -> SamplingTask:
-        """Return the sampling and scoring of this iteration."""
         credit = self.config.credit
         if credit == "alternate":
             credit = "team" if search.iteration % 2 else "robot"
@@ -123,7 +120,6 @@ class SamplingPlanner(Planner):
         return state, self.run(search)
 
     def run(self, search: SolveRun) -> Iteration:
-        """One run of the sampling loop over the whole team."""
         base, mean = self.initial(search)
         return self.sampled(search, self.task(search, base), self.credited(search), mean, self.stages(search))[0]
 

@@ -32,8 +32,7 @@ class MBDConfig(DenoisingConfig):
 
     num_steps: Steps = 10_000
     max_iterations: Count = 1
-    #: Steps of the run that an iteration does, after which its controls are evaluated; ``None`` for all
-    check_every: Steps | None = None
+    check_every: Steps | None = None  #: Steps after which a run's controls are evaluated; ``None`` for all
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,10 +35,8 @@ seeds, and a third of these to four times as many. The trials are in
 whose preset was best keeps it.
 """
 
-
 REFERENCE_STEPS = 100
-MOST_NOISE = 1e6
-"""Largest standard deviation of noise, in shares of the limits."""
+MOST_NOISE = 1e6  #: Largest standard deviation of noise, in shares of the limits
 
 
 def alpha_bar(num_steps: int, beta_start: float, beta_end: float) -> np.ndarray:
@@ -55,10 +53,7 @@ def alpha_bar(num_steps: int, beta_start: float, beta_end: float) -> np.ndarray:
 
 
 def annealed(num_steps: int, beta_start: float, beta_end: float) -> FloatArray:
-    """``(num_steps,)`` standard deviations ``sqrt(1 / alpha_bar - 1)``, from the first denoising step to the last.
-
-    Paper, Algorithm 1, line 3.
-    """
+    """``(num_steps,)`` deviations ``sqrt(1 / alpha_bar - 1)``, first step to last (paper, Algorithm 1, line 3)."""
     return np.sqrt(1 / alpha_bar(num_steps, beta_start, beta_end)[::-1] - 1).astype(np.float32)
 
 
@@ -117,17 +112,12 @@ class SoftmaxSettings(CheckedSettings):
 
     @property
     def weights(self) -> SoftmaxWeights:
-        """The rule."""
         return SoftmaxWeights(self.temperature, self.weight_cutoff)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DiffusionSettings(CheckedSettings):
-    """Settings of methods whose noise follows the diffusion schedule.
-
-    Raises:
-        ValueError: If the first is above the last.
-    """
+    """Settings of methods whose noise follows the diffusion schedule; ValueError if the first is above the last."""
 
     beta_start: Variance = 1e-4  #: First variance of the diffusion schedule
     beta_end: Variance = 2e-2  #: Last variance of the diffusion schedule

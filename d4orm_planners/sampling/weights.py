@@ -11,8 +11,7 @@ import numpy as np
 
 from d4orm_planners.engine.weighting import softmax_weights
 
-Array: TypeAlias = Any
-"""An array of NumPy or JAX, whichever ``xp`` is; the two have no common type."""
+Array: TypeAlias = Any  #: An array of NumPy or JAX, whichever ``xp`` is; the two have no common type
 
 
 @dataclass(frozen=True)
@@ -23,13 +22,10 @@ class SoftmaxWeights:
     """
 
     temperature: float  #: ``lambda``; smaller values follow the best samples more closely
-    #: Weights below this share of the largest are dropped. What they would add is less than the sampling error.
-    cutoff: float = 0.0
+    cutoff: float = 0.0  #: Weights below this share of the largest are dropped: they add less than the sampling error
 
     def __call__(self, rewards: Array, xp: ModuleType, log_ratio: Array | None = None) -> Array:
-        """Weights of ``rewards`` ``(..., M)``, times ``exp(log_ratio)`` where given; a sample at minus infinity gets
-        none.
-        """
+        """Weights of ``rewards`` ``(..., M)``, times ``exp(log_ratio)`` if given; none for minus infinity."""
         if xp is np:
             return softmax_weights(rewards, self.temperature, self.cutoff, log_ratio)
         usable = rewards > -xp.inf

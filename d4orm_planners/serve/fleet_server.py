@@ -14,8 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_planners.base.controller import Controller
 from d4orm_planners.base.measured_states import OLDEST
 from d4orm_planners.serve import wire
-from d4orm_planners.serve.fleet_robot import FleetRobot
-from d4orm_planners.serve.wire import RosSession, Subscriber, position_of, turned
+from d4orm_planners.serve.wire import FleetRobot, RosSession, Subscriber, position_of, turned
 from d4orm_planners.tracking import ros_messages as ros
 from d4orm_planners.tracking.reference_feedback import ControlSetpoint
 from d4orm_planners.tracking.steering import braking_share
@@ -23,12 +22,9 @@ from d4orm_planners.tracking.steering import braking_share
 NODE = "d4orm"
 DRIVING, BRAKING, PLANNING, WAITING, STOPPED = "driving", "braking", "planning", "waiting", "stopped"
 """States of the server: robots drive; brake for replanning; rest for planning, a silent robot or an emergency stop."""
-LEVELS = {DRIVING: 0, BRAKING: 0, PLANNING: 0, WAITING: 1, STOPPED: 2}
-"""Levels of diagnostics: well, warning, error."""
-AT_REST = 0.05
-"""Share of its largest speed up to which a robot that was stopped counts as at rest."""
-TELL = 1.0
-"""Time between two diagnostics of the same state [s]."""
+LEVELS = {DRIVING: 0, BRAKING: 0, PLANNING: 0, WAITING: 1, STOPPED: 2}  #: Levels of diagnostics: well, warning, error
+AT_REST = 0.05  #: Share of its largest speed up to which a robot that was stopped counts as at rest
+TELL = 1.0  #: Time between two diagnostics of the same state [s]
 
 
 class Period(NamedTuple):
@@ -61,11 +57,6 @@ class FleetServer:
         seed: Of the controller.
         stamped: Whether robots' clocks are this machine's: states are as old as their stamps say then, and those older
             than the deadline are not taken. Else they are of the moment in which they are read.
-
-    Attributes:
-        state: What it does.
-        loops: Times of the last periods' work [s].
-        refusal: Reason why a goal was refused last.
     """
 
     def __init__(
@@ -102,6 +93,7 @@ class FleetServer:
         self._commanding = threading.RLock()
         self._e_stop = session.subscriber("e_stop", wire.BOOL, self._mind)
         self._inputs = *self._odometry, *self._poses, *self._goals, self._e_stop
+        # What it does, when it told so, times of the last periods' work [s], and why a goal was refused last.
         self.state, self._told, self.loops, self.refusal = WAITING, -np.inf, [0.0], ""
 
     def run(self, over: threading.Event) -> None:

@@ -16,6 +16,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -32,34 +33,20 @@ _zenoh: Any = LazyModule("zenoh", "d4orm serve", "zenoh")
 _rosbags: Any = LazyModule("rosbags.typesys", "d4orm serve", "ros")
 
 BOOL, POSE, ODOMETRY = "std_msgs/msg/Bool", "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"
-WIRES = ("rmw_zenoh", "bridge")
-"""Mappings of topics: rmw_zenoh's, and that of zenoh-bridge-ros2dds."""
+WIRES = ("rmw_zenoh", "bridge")  #: Mappings of topics: rmw_zenoh's, and that of zenoh-bridge-ros2dds
 TWIST, TRAJECTORY = "geometry_msgs/msg/Twist", "trajectory_msgs/msg/MultiDOFJointTrajectory"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
-
-DEPTH = 64
-"""Messages of a topic that wait to be read; older ones make room."""
-RELIABLE = f"::,{DEPTH}:,:,:,,"
-"""Quality of service as tokens have it: all as by default, but for the depth."""
-UNNORMALISED = 0.1
-"""Most by which the norm of a quaternion differs from one."""
-TURN_RATE = "turn_rate"
-"""Name of a state component that odometry tells."""
+DEPTH = 64  #: Messages of a topic that wait to be read; older ones make room
+RELIABLE = f"::,{DEPTH}:,:,:,,"  #: Quality of service as tokens have it: all as by default, but for the depth
+UNNORMALISED = 0.1  #: Most by which the norm of a quaternion differs from one
+TURN_RATE = "turn_rate"  #: Name of a state component that odometry tells
 _ATTACHMENT = struct.Struct("<qqB16s")
 
 
 class RosSession:
-    """A ROS 2 node on a Zenoh network.
+    """A ROS 2 node on a Zenoh network, of a ROS domain, by one of :data:`WIRES`.
 
-    Args:
-        settings: Network of the others.
-        domain: ROS domain.
-        node: Name of the node.
-        wire: One of :data:`WIRES`.
-
-    Raises:
-        ImportError: If zenoh or rosbags is not installed.
-        ValueError: If zenoh refuses the settings.
+    ImportError without zenoh or rosbags; ValueError if zenoh refuses the settings.
     """
 
     def __init__(self, settings: ZenohSettings, domain: int, node: str, wire: str = WIRES[0]) -> None:
@@ -80,11 +67,9 @@ class RosSession:
         self.close()
 
     def close(self) -> None:
-        """Leave the network."""
         self._session.close()
 
     def publisher(self, topic: str, kind: str) -> Publisher:
-        """A publisher of messages of a type, such as :data:`TWIST`."""
         zenoh = load(_zenoh)
         key = topic if self._bridge else _key(self._domain, topic, kind)
         self._declare("MP", topic, kind)
@@ -94,10 +79,7 @@ class RosSession:
         return Publisher(declared, attached=not self._bridge)
 
     def subscriber(self, topic: str, kind: str, heard: Callable[[Subscriber], None] | None = None) -> Subscriber:
-        """A subscriber to messages of a type.
-
-        ``heard`` is called with it, in a thread of the network's, as soon as there is a message to take.
-        """
+        """A subscriber to messages of a type; ``heard`` is called with it, in another thread, once there is one."""
         self._declare("MS", topic, kind)
         # Whatever the hash: ROS 2 Humble has none.
         key = topic if self._bridge else _key(self._domain, topic, kind).rpartition("/")[0] + "/*"
@@ -124,7 +106,6 @@ class Publisher:
         self._attached = attached
 
     def publish(self, message: Any) -> None:
-        """Send a message."""
         self._number += 1
         numbered = _ATTACHMENT.pack(self._number, time.time_ns(), len(self._identity), self._identity)
         content = ros.message_types().serialize_cdr(message, message.__msgtype__)
@@ -132,11 +113,7 @@ class Publisher:
 
 
 class Subscriber:
-    """A topic to read from.
-
-    Attributes:
-        refused: Messages that could not be read.
-    """
+    """A topic to read from; ``refused`` counts messages that could not be read."""
 
     def __init__(self, kind: str, heard: Callable[[Subscriber], None] | None = None) -> None:
         self._kind, self._heard, self.refused = kind, heard, 0
@@ -257,3 +234,45 @@ def diagnostics(node: str, level: int, state: str, values: dict[str, str]) -> An
     pairs = [ros.make("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
     status = ros.make("diagnostic_msgs/msg/DiagnosticStatus", level, node, state, node, pairs)
     return ros.make(DIAGNOSTICS, ros.header(time.time_ns()), [status])
+
+
+BASE = 0.5  #: Share of a period over which velocities are taken from poses
+
+
+@dataclass
+class FleetRobot:
+    """A robot as it was last heard."""
+
+    name: str  #: Name of its topics
+    state: FloatArray  #: ``(n,)`` as last heard; not a number before, and what no message says
+    heard: float = -np.inf  #: When it was last heard, by this process's clock [s]
+    measured: float = -np.inf  #: When that was, likewise; as it was heard, if no stamps tell [s]
+    heading: float = 0.0  #: As last heard [rad]
+    yaw: float = 0.0  #: As first heard, which a robot whose model has no heading keeps [rad]
+    stand: Floats | None = None  #: ``(d,)`` where it is held, or braking to a halt, while the team does not drive [m]
+    #: ``(3,)`` by the last two poses that are far enough apart, in the frame of all [m/s]
+    velocity: Floats = field(default_factory=lambda: np.zeros(3))
+    #: Time by the robot's clock and by this process's [s], and ``(3,)`` position of the later one [m]
+    posed: tuple[float, float, Floats] | None = None
+    clock_resets: int = 0  #: Times that its clock was set back, or forward beyond the deadline
+
+    def take_state(self, state: FloatArray, heading: float, now: float, age: float) -> None:
+        """Take a state ``(n,)`` and a heading [rad], measured ``age`` seconds ago."""
+        self.yaw = self.yaw if np.isfinite(self.heard) else heading
+        self.state, self.heading, self.heard, self.measured = state, heading, now, now - age
+
+    def take_pose(self, stamped: Any, now: float, period: float, deadline: float) -> None:
+        """Take the velocity from a ``geometry_msgs/PoseStamped`` and one that is older by half a period [s] at least.
+
+        Where the robot's clock was set in between it stays as it is.
+        """
+        stamp, position = time_of(stamped.header), position_of(stamped.pose.position)
+        if self.posed is not None:
+            passed, waited = stamp - self.posed[0], now - self.posed[1]
+            if 0 <= passed < BASE * period:
+                return
+            if 0 < passed <= waited + deadline:
+                self.velocity = (position - self.posed[2]) / passed
+            else:
+                self.clock_resets += 1
+        self.posed = stamp, now, position

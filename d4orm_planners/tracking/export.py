@@ -38,12 +38,9 @@ __all__ = ["FORMATS", "ExportReport", "Setpoints", "export_motion", "sample_moti
 MAX_RATE, MAX_SAMPLES = 1e5, 10**8
 MEMORY, PIECE_BYTES = 4096, 132
 MOST_PIECES = MEMORY // PIECE_BYTES
-CLOSE = 1 / 50
-"""Largest distance from the motion that is aimed at, as a share of the smallest robot's radius."""
-CHECKS = 32
-"""Times a piece at which that distance is looked at."""
-MEETING = 4
-"""Derivatives, the values included, in which pieces agree where they meet."""
+CLOSE = 1 / 50  #: Largest distance from the motion that is aimed at, as a share of the smallest robot's radius
+CHECKS = 32  #: Times a piece at which that distance is looked at
+MEETING = 4  #: Derivatives, the values included, in which pieces agree where they meet
 AXES = ("x", "y", "z", "yaw")
 
 
@@ -189,8 +186,7 @@ class ExportReport:
     deviation: float  #: Largest distance from the plan at its steps, of polynomials at most [m]
     min_separation: float  #: Least gap between two robots [m]
     min_clearance: float  #: Least gap to an obstacle or bound [m]
-    #: Least height of a robot above another that it flies over [m]; infinite where none does, or in the plane
-    min_overhead: float
+    min_overhead: float  #: Least height of a robot above another it flies over [m]; infinite without, or in the plane
     heights: tuple[float, float]  #: Lowest and highest z of any robot [m]
     pieces: int | None = None  #: Polynomials a robot, or ``None``
 

@@ -1,17 +1,30 @@
-"""Driving to the goal as if alone: straight, or by curves to a goal heading where a robot turns only as it drives."""
+"""Driving to the goal as if alone: straight, or by curves to a goal heading where a robot turns only as it drives.
+
+Curves are those of J. A. Reeds and L. A. Shepp, "Optimal paths for a car that goes both forwards and backwards",
+Pacific Journal of Mathematics, 1990: arcs of the smallest circle and a straight between them. Models back up on such
+arcs only, so that straights are driven forwards. Lengths are in turning radii, so that an arc's is its angle; backwards
+they are negative.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
+from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.engine.caching import cached_kernel
+from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled
+from d4orm_env.engine.elementary import cosine, sine
+from d4orm_env.engine.footprint_contacts import POSE, touches_static
+from d4orm_env.engine.simd import TILE
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.tracking.free_curves import free_curves
-from d4orm_planners.tracking.pose_curves import first_stretches
 from d4orm_planners.tracking.steering import (
     CREEPING,
     by_model,
@@ -21,12 +34,200 @@ from d4orm_planners.tracking.steering import (
     track_velocities,
 )
 
-TURNING, REVERSING = 1.5, 2.4
-"""Angles from the heading to a velocity for which wheels turn as far as they go, forwards and in reverse [rad]."""
+LEFT, STRAIGHT, RIGHT = 1.0, 0.0, -1.0
+QUARTER = np.pi / 2
+Word: TypeAlias = tuple[tuple[float, ...], BoolArray, tuple[Floats | float, ...]]
+"""Sides of a curve's stretches, where it exists, and their lengths."""
+CUSP, WHEELS = 0.5, 0.1
+"""Lengths that a change of gear and turning wheels from straight ahead as far as they go count for: of two curves as
+long as each other a robot keeps to one."""
+
+
+class FirstStretch(NamedTuple):
+    """The first arc or straight of a curve each."""
+
+    side: Floats  #: ``(K,)`` :data:`LEFT`, :data:`STRAIGHT` or :data:`RIGHT`
+    length: Floats  #: ``(K,)`` negative backwards; zero if there is nothing to drive
+    free: BoolArray  #: ``(K,)`` whether it was chosen
+
+
+def first_stretches(
+    ahead: Floats, left: Floats, turns: Floats, short: Floats, wheels: Floats,
+    choose: Callable[[Floats, Floats], IntArray] | None = None,
+) -> FirstStretch:  # fmt: skip
+    """First stretches of the shortest curves.
+
+    Args:
+        ahead: ``(K,)`` from the robots to their goals.
+        left: ``(K,)`` likewise, to the left.
+        turns: ``(K,)`` from the robots' headings to their goals' [rad].
+        short: ``(K,)`` length up to which a stretch is left out.
+        wheels: ``(K,)`` present curvatures; NaN for robots that take any at once.
+        choose: ``(K,)`` which is taken of the sides and lengths ``(W, K, 5)`` of all curves, the shortest first; -1
+            for none, and so for the shortest.
+    """
+    sides, lengths = curves(ahead, left, turns, short)
+    gears = np.where(np.abs(lengths) > short[:, None], np.sign(lengths), 0.0)
+    costs, first = np.abs(lengths).sum(axis=-1), (gears != 0).argmax(axis=-1)
+    gear, side, inert = np.zeros_like(costs), np.broadcast_to(wheels, costs.shape), ~np.isnan(wheels)
+    for own_gear, own_side in zip(np.moveaxis(gears, -1, 0), np.moveaxis(sides, -1, 0), strict=True):
+        driven = own_gear != 0
+        costs += CUSP * (own_gear * gear < 0) + np.where(driven & inert, WHEELS * np.abs(own_side - side), 0)
+        gear, side = np.where(driven, own_gear, gear), np.where(driven, own_side, side)
+    best, every, found = costs.argmin(axis=0), np.arange(len(turns)), np.full(len(turns), -1)
+    if choose is not None:
+        order = costs.argsort(axis=0, kind="stable")
+        found = choose(sides[order, every], lengths[order, every])
+        best = order[np.maximum(found, 0), every]
+    chosen = best, every, first[best, every]
+    return FirstStretch(sides[chosen], np.where(gears[chosen] != 0, lengths[chosen], 0.0), found >= 0)
+
+
+def curves(ahead: Floats, left: Floats, turns: Floats, short: Floats) -> tuple[Floats, Floats]:
+    """Sides and lengths ``(W, K, 5)`` of the stretches of all curves, infinite for one that does not lead there."""
+    # As they are, seen in a mirror, driven in the other gear, and from the goal to the robot.
+    gear, mirror = np.array([1.0, 1.0, -1.0, -1.0])[:, None], np.array([1.0, -1.0, 1.0, -1.0])[:, None]
+    x, y, turn = gear * ahead, mirror * left, gear * mirror * turns
+    sine, cosine = portable.sin(turn), portable.cos(turn)
+    forth, back = (
+        _words(x, y, turn, sine, cosine, short),
+        _words(x * cosine + y * sine, x * sine - y * cosine, turn, sine, cosine, short),
+    )
+    sides, lengths = [], []
+    for words, order in ((forth, slice(None)), (back, slice(None, None, -1))):
+        for pattern, exists, stretches in words:
+            row = np.stack(np.broadcast_arrays(*stretches), axis=-1) * gear[..., None]
+            side = np.array(pattern) * mirror[..., None] + np.zeros_like(row)
+            exists = exists & ~((side == STRAIGHT) & (row < -short[:, None])).any(axis=-1)
+            sides.append(side[..., order])
+            lengths.append(np.where(exists[..., None], row, np.inf)[..., order])
+    return np.concatenate(sides), np.concatenate(lengths)
+
+
+def _words(x: Floats, y: Floats, turn: Floats, sine: Floats, cosine: Floats, short: Floats) -> list[Word]:
+    """The paper's curves that begin forwards to the left, equations 8.1 to 8.11; those of four arcs are left out.
+
+    The same with arcs backwards lead there too: a robot that has driven past the end of one has not lost its curve.
+    """
+    same, other = (x - sine, y - 1 + cosine), (x + sine, y - 1 - cosine)
+    (near, bearing), (far, angle) = _polar(*same), _polar(*other)
+    last = _within(turn - bearing)
+    words: list[Word] = [((LEFT, STRAIGHT, LEFT, 0, 0), near >= 0, (bearing, near, last, 0, 0))]
+    straight = np.sqrt(np.maximum(far * far - 4, 0))
+    first = _within(angle + portable.arctan2(np.full_like(far, 2.0), straight))
+    last = _within(first - turn)
+    apart = far >= 2
+    words.append(((LEFT, STRAIGHT, RIGHT, 0, 0), apart, (first, straight, last, 0, 0)))
+    # Two cusps, the straight between quarter circles.
+    straight = 4 - straight
+    first = _within(
+        portable.arctan2((4 - straight) * other[0] - 2 * other[1], -2 * other[0] + (straight - 4) * other[1])
+    )
+    last = _within(first - turn)
+    exists = apart & (straight <= short)
+    words.append(((LEFT, RIGHT, STRAIGHT, LEFT, RIGHT), exists, (first, -QUARTER, straight, -QUARTER, last)))
+    half = np.minimum(near / 4, 1)
+    middle = -2 * portable.arctan2(half, np.sqrt(1 - half * half))
+    first = _within(bearing + middle / 2 + np.pi)
+    last = _within(turn - first + middle)
+    words.append(((LEFT, RIGHT, LEFT, 0, 0), near <= 4, (first, middle, last, 0, 0)))
+    reach = np.sqrt(np.maximum(near * near - 4, 0))
+    first = _within(bearing + portable.arctan2(reach, np.full_like(reach, -2.0)))
+    last = _within(turn - QUARTER - first)
+    exists = (near >= 2) & (reach >= 2 - short)
+    words.append(((LEFT, RIGHT, STRAIGHT, LEFT, 0), exists, (first, -QUARTER, 2 - reach, last, 0)))
+    first = _polar(-other[1], other[0])[1]
+    last = _within(first + QUARTER - turn)
+    exists = apart
+    words.append(((LEFT, RIGHT, STRAIGHT, RIGHT, 0), exists, (first, -QUARTER, 2 - far, last, 0)))
+    return words
+
+
+def _polar(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Length and angle of vectors."""
+    return np.sqrt(x * x + y * y), portable.arctan2(y, x)
+
+
+def _within(angle: Floats) -> Floats:
+    """Angles from -pi to pi, without whole turns."""
+    return angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
+
+
+PARTS = 2  #: Poses that are looked at in what the fastest robot drives in a step
+
+
+def free_curves(problem: Problem, robots: IntArray, poses: Floats, sides: Floats, lengths: Floats) -> IntArray:
+    """``(R,)`` the first curve of each robot that keeps the margin from all obstacles and bounds, or else that touches
+    none; -1 where there is none either, and for robots with trailers, which do not look.
+
+    Args:
+        problem: The problem.
+        robots: ``(R,)`` whose they are.
+        poses: ``(R, 3)`` where they are.
+        sides: ``(W, R, S)`` of the curves' stretches, in the order in which they are preferred.
+        lengths: ``(W, R, S)`` in turning radii; curves with infinite ones are none.
+    """
+    team, chosen = problem.team, np.full(len(robots), -1)
+    # Of one type for all problems.
+    arrays = problem.arrays._replace(turns_at_goals=None, goal_direction=None, squared_goal_chord=None, footprints=None)
+    footprints = team.all_footprint_arrays
+    buffer = np.zeros((2 + POSE * len(footprints.robot)) * TILE, np.float32)
+    for row, robot in enumerate(robots.tolist()):
+        if team.robot_models[robot].trailers:
+            continue
+        radius = float(team.turning_radius[robot])
+        side, length = (np.ascontiguousarray(part[:, row]) for part in (sides, lengths))
+        for extra in (np.float32(problem.margin), ZERO):
+            if chosen[row] < 0:
+                chosen[row] = first_free(
+                    footprints, arrays, robot, extra, radius, problem.stride / PARTS / radius, poses[row], side, length,
+                    buffer,
+                )  # fmt: skip
+    return chosen
+
+
+@compiled
+def _is_clear(
+    f: FootprintArrays, arrays: ProblemArrays, k: Whole, x: float, y: float, heading: float, extra: np.float32,
+    buffer: FloatArray,
+) -> bool:  # fmt: skip
+    poses, o = buffer[2 * TILE :], np.int64(k) * POSE * TILE
+    poses[o], poses[o + TILE] = cosine(np.float32(heading)), sine(np.float32(heading))
+    poses[o + 2 * TILE] = poses[o + 3 * TILE] = ZERO
+    position = (np.float32(x), np.float32(y), ZERO)
+    return not touches_static(f, arrays, k, position, poses, POSE * TILE, 0, extra, buffer)
+
+
+@cached_kernel(**OPTIONS)
+def first_free(
+    f: FootprintArrays, arrays: ProblemArrays, k: int, extra: np.float32, radius: float, apart: float, pose: Floats,
+    sides: Floats, lengths: Floats, buffer: FloatArray,
+) -> int:  # fmt: skip
+    """Look for the first of the curves ``(W, S)`` from a pose that keeps clear, seen every ``apart``; -1 for none."""
+    for w in range(lengths.shape[0]):
+        x, y, heading, free = pose[0], pose[1], pose[2], bool(np.isfinite(lengths[w, 0]))
+        for i in range(lengths.shape[1]):
+            count = int(np.ceil(abs(lengths[w, i]) / apart)) if free else 0
+            for _ in range(count):
+                # The chord of an arc points half-way between the headings at its ends.
+                gone = lengths[w, i] / count
+                half = 0.5 * sides[w, i] * gone
+                chord = 2 * np.float64(sine(np.float32(half))) * sides[w, i] if sides[w, i] != 0 else gone
+                x += radius * chord * np.float64(cosine(np.float32(heading + half)))
+                y += radius * chord * np.float64(sine(np.float32(heading + half)))
+                heading += 2 * half
+                if not _is_clear(f, arrays, k, x, y, heading, extra, buffer):
+                    free = False
+                    break
+        if free:
+            return w
+    return -1
+
+
+TURNING, REVERSING = 1.5, 2.4  #: Angles from heading to velocity at which wheels turn fully, forwards and back [rad]
 STEERING_FIRST = 10.0
 """By how much slower a robot drives while its wheels turn: shares of its pace by curvatures, of the smallest circle."""
-UNNOTICED = 0.08
-"""Share of what may be missed at a goal up to which a stretch on the way there is left out."""
+UNNOTICED = 0.08  #: Share of what may be missed at a goal up to which a stretch on the way there is left out
 
 
 def drive_to_goal(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:

@@ -30,8 +30,7 @@ class Route(NamedTuple):
 
     points: Floats  #: ``(P, 3)`` float64 [m]
     times: Floats  #: ``(P,)`` float64 when each is passed, of which only the order counts
-    #: ``(P,)`` float64 radius of the bend at each point [m]; infinite on straight stretches, zero at sharp corners
-    bends: Floats
+    bends: Floats  #: ``(P,)`` float64 radius of the bend at each point [m]; infinite if straight, zero if sharp
 
 
 class Routes(NamedTuple):
@@ -61,14 +60,10 @@ class Corners(NamedTuple):
     arrives: Floats  #: ``(C,)`` float64 when it gets there
 
 
-BRAKING = 0.5
-"""Share of its acceleration that a robot counts on before corners and in them."""
-RESERVE = 0.8
-"""Share of the path to where it must stop that a robot plans to stop in."""
-BEYOND = 4.0
-"""Distance beyond its goal that a robot plans to drive if stopped by arriving, in lengths of a stop from full speed."""
-SLOWEST = 0.1
-"""Share of its speed at which a robot creeps round the sharpest corner."""
+BRAKING = 0.5  #: Share of its acceleration that a robot counts on before corners and in them
+RESERVE = 0.8  #: Share of the path to where it must stop that a robot plans to stop in
+BEYOND = 4.0  #: Distance beyond its goal that a robot plans to drive if arriving stops it, in stops from full speed
+SLOWEST = 0.1  #: Share of its speed at which a robot creeps round the sharpest corner
 
 
 class Progress(NamedTuple):
@@ -196,14 +191,8 @@ def route_kernel(name: str) -> RouteStep:
 def drive_routes(problem: Problem, routes: Routes, most_steps: int) -> tuple[FloatArray, Floats, IntArray]:
     """Drive the team along its routes until all have arrived, or for ``most_steps``.
 
-    Args:
-        problem: The team.
-        routes: Its routes.
-        most_steps: ``T``, if it does not end sooner.
-
-    Returns:
-        Controls ``(T, K, m)``, positions ``(T + 1, K, 3)`` float64 [m] and ``(K,)`` the step of each arrival; ``T + 1``
-        for one that has not arrived.
+    Controls ``(T, K, m)``, positions ``(T + 1, K, 3)`` float64 [m] and ``(K,)`` the step of each arrival; ``T + 1`` for
+    one that has not arrived.
     """
     d, num_robots = problem.dimension, problem.num_robots
     paces = np.concatenate(

@@ -33,22 +33,17 @@ Turning: TypeAlias = Callable[[Row, Row, Row, np.float32, bool, Row], tuple[Row,
 LOOKAHEAD = 1 / 3
 """Distance to the point of its route that a robot heads for, beyond what it drives in a step and a half, in radii of
 the largest robot, as all lengths below."""
-CIRCLES = 0.8
-"""The same of one that drives in order to turn, in radii of its turning circle."""
-REACHED, COINCIDING = 2 / 15, 1 / 15
-"""Distance from which on a robot has come to a point, and up to which points of a route are taken for one."""
+CIRCLES = 0.8  #: The same of one that drives in order to turn, in radii of its turning circle
+REACHED, COINCIDING = 2 / 15, 1 / 15  #: Distances at which a robot is at a point, and at which two are one
 FACING, CREEP = np.float32(0.8), np.float32(0.01)
 """Cosine of the angle between heading and path from which on a robot drives, and share of its speed before that."""
-UNDER_WAY = np.float32(0.05)
-"""Share of its speed from which on a robot keeps its gear for longer, lest it change it all the time."""
-BEHIND = np.float32(0.5)
-"""Cosine of the angle behind it within which a point must lie that a robot under way changes gear for."""
+UNDER_WAY = np.float32(0.05)  #: Share of its speed from which a robot keeps its gear longer, lest it changes often
+BEHIND = np.float32(0.5)  #: Cosine of the angle behind it of a point for which a robot under way changes gear
 BESIDE = (np.float32(0.3), np.float32(0.954))
 """Cosine and sine of the angle beyond which a point is steered for as sharply as this."""
 ASIDE = (np.float32(0.7), np.float32(0.3), np.float32(0.2))
 """Sine of the angle beyond which a robot backs up that comes nearer, is at rest, or is backing up already."""
-BACKING = np.float32(0.5)
-"""Share of its pace at which a robot backs up."""
+BACKING = np.float32(0.5)  #: Share of its pace at which a robot backs up
 
 
 def lookaheads(problem: Problem) -> Floats:

@@ -23,14 +23,10 @@ from d4orm_planners.tracking.steering import (
     track_velocities,
 )
 
-HORIZON = 2.0
-"""Time that the regulator looks ahead, in times in which the slowest robot gets to full speed."""
-LOST = 1.0
-"""Difference of a heading from the reference's beyond which its slopes say nothing [rad]."""
-NEAR = 2.0
-"""Distance from the reference, in radii, up to which robots that are lost stand; from further off they drive to it."""
-DIFFERENCE = 1e-2
-"""Share of a unit by which states and controls are varied to find the slopes of the motion."""
+HORIZON = 2.0  #: Time that the regulator looks ahead, in times in which the slowest robot gets to full speed
+LOST = 1.0  #: Difference of a heading from the reference's beyond which its slopes say nothing [rad]
+NEAR = 2.0  #: Distance from the reference, in radii, at which lost robots stand; from further they drive to it
+DIFFERENCE = 1e-2  #: Share of a unit by which states and controls are varied to find the slopes of the motion
 
 
 class Reference(NamedTuple):
@@ -44,44 +40,25 @@ class Reference(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ControlSetpoint:
-    """Setpoint of a team until the next step; its arrays are read-only.
+    """Setpoint of a team until the next step; its arrays are read-only."""
 
-    Attributes:
-        position: ``(K, d)`` where robots are to be at the end of the period [m].
-        velocity: ``(K, d)`` their velocity then [m/s].
-        acceleration: ``(K, d)`` on the way there [m/s^2].
-        heading: ``(K,)`` heading at the end of the period [rad]; zero for robots whose model has none.
-        control: ``(K, m)`` controls of the robots' models, within each robot's limits.
-        arrived: ``(K,)`` bool: it stays at its goal from now on.
-        held: True if the policy did not answer in time: robots brake.
-    """
-
-    position: Floats
-    velocity: Floats
-    acceleration: Floats
-    heading: Floats
-    control: FloatArray
-    arrived: BoolArray
-    held: bool
+    position: Floats  #: ``(K, d)`` where robots are to be at the end of the period [m]
+    velocity: Floats  #: ``(K, d)`` their velocity then [m/s]
+    acceleration: Floats  #: ``(K, d)`` on the way there [m/s^2]
+    heading: Floats  #: ``(K,)`` heading at the end of the period [rad]; zero for robots whose model has none
+    control: FloatArray  #: ``(K, m)`` controls of the robots' models, within each robot's limits
+    arrived: BoolArray  #: ``(K,)`` bool: it stays at its goal from now on
+    held: bool  #: True if the policy did not answer in time: robots brake
 
 
 class ActuatorLag:
-    """Lag of first order with which actuators approach what they are told.
-
-    Args:
-        constants: ``(K,)`` time constants [s].
-        dt: Time step [s].
-
-    Attributes:
-        constants: ``(K,)`` time constants [s].
-        remains: ``(K, 1)`` share of a difference from what they are told that is left after a step.
-        share: ``(K, 1)`` of such a difference in the mean over a step.
-    """
+    """Lag of first order with which actuators approach what they are told, by time constants ``(K,)`` [s]."""
 
     def __init__(self, constants: Floats, dt: float) -> None:
-        self.constants = constants
+        self.constants = constants  #: ``(K,)`` time constants [s]
+        #: ``(K, 1)`` share of a difference from what they are told that is left after a step
         self.remains: Floats = np.where(constants > 0, np.exp(-dt / np.maximum(constants, 1e-12)), 0.0)[:, None]
-        self.share: Floats = (constants / dt)[:, None] * (1 - self.remains)
+        self.share: Floats = (constants / dt)[:, None] * (1 - self.remains)  #: ``(K, 1)`` of it in the mean over a step
 
     def mean(self, told: Floats, applied: Floats) -> Floats:
         """``(K, m)`` what they apply in the mean over a step, and ``applied`` when it begins."""
@@ -96,12 +73,7 @@ class LaggedReference:
     """Another reference, followed as by robots whose actuators lag: those can drive so, and need no control beyond it.
 
     Its states are that one's by a low-pass filter, which is what linear models do. All of a team lag as the slowest, so
-    that none gets ahead of the others.
-
-    Args:
-        problem: The robots.
-        states: ``(K, n)`` where they begin.
-        lag: That of their actuators.
+    that none gets ahead of the others. They begin in ``states`` ``(K, n)``.
     """
 
     def __init__(self, problem: Problem, states: FloatArray, lag: ActuatorLag) -> None:

@@ -22,22 +22,14 @@ from d4orm_env.dynamics.robot_model import PYTHON_OPS, Model
 from d4orm_planners.tracking.splines import DEGREE, Steps, quadrature, through
 
 MAX_ITERATIONS = 30
-FRESH = 2
-"""Iterations whose slopes are found anew; later ones go on with these as long as no coefficients are newly held."""
-SETTLED = 1e-5
-"""Largest change of a pose in the last iteration, as a share of the radius."""
-END_WEIGHT = 1e6
-"""Weight of the squared distance from the plan at the end, against that at any other step."""
-STEERING_WEIGHT = 0.1
-"""Weight of the squared distance from the plan's curvature, as a share of the largest, times the radius."""
-BOUND_WEIGHT = 1e9
-"""Weight of coefficients that are held at the largest curvature."""
-WITHIN = 1 - 1e-3
-"""Share of the largest curvature that is used."""
-STANDING = 1e-3
-"""Way in a step below which a robot counts as standing, in radii."""
-FINER = 8
-"""Knots in a step of the splines that poses become."""
+FRESH = 2  #: Iterations whose slopes are found anew; later ones keep them as long as no coefficients are newly held
+SETTLED = 1e-5  #: Largest change of a pose in the last iteration, as a share of the radius
+END_WEIGHT = 1e6  #: Weight of the squared distance from the plan at the end, against that at any other step
+STEERING_WEIGHT = 0.1  #: Weight of the squared distance from the plan's curvature, of the largest, times the radius
+BOUND_WEIGHT = 1e9  #: Weight of coefficients that are held at the largest curvature
+WITHIN = 1 - 1e-3  #: Share of the largest curvature that is used
+STANDING = 1e-3  #: Way in a step below which a robot counts as standing, in radii
+FINER = 8  #: Knots in a step of the splines that poses become
 
 
 class Wheeled(NamedTuple):
@@ -107,12 +99,8 @@ def finer(spline: BSpline, steps: int) -> BSpline:
 def roll(robots: Wheeled, dt: float, smoothness: float) -> tuple[BSpline, BSpline]:
     """Splines of their positions [m] and headings [rad], ``(R, 3)``, from their speed to rest, and curvatures ``(R,)``.
 
-    The curvatures [1/m] are those steered, also at rest; zero for robots that turn on the spot.
-
-    Args:
-        robots: What is fitted, one pose every ``dt``.
-        dt: [s].
-        smoothness: Weight of squared third differences of coefficients, of ways, and of turns times the radius.
+    The curvatures [1/m] are those steered, also at rest; zero for robots that turn on the spot. Poses are ``dt``
+    [s] apart; ``smoothness`` weights squared third differences of coefficients, of ways, and of turns times the radius.
     """
     count = len(robots.poses)
     grid = Steps(robots.poses.shape[1] - 1, dt, count)

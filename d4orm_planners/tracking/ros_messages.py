@@ -28,11 +28,7 @@ BAG_VERSION: Final = 9
 
 @cache
 def message_types() -> Any:
-    """The types of messages, with their encoding.
-
-    Raises:
-        ImportError: If rosbags is not installed.
-    """
+    """The types of messages, with their encoding; ImportError without rosbags."""
     return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
 
@@ -109,11 +105,7 @@ def _nanoseconds(seconds: float) -> int:
 
 
 def write_bag(setpoints: Setpoints, folder: Path, height: float, storage: str) -> None:
-    """Write a new folder with the bag, stored as ``"SQLITE3"`` or ``"MCAP"``.
-
-    Raises:
-        ModuleNotFoundError: Without rosbags.
-    """
+    """Write a new folder with the bag, stored as ``"SQLITE3"`` or ``"MCAP"``; ModuleNotFoundError without rosbags."""
     with rosbag2.Writer(folder, version=BAG_VERSION, storage_plugin=rosbag2.StoragePlugin[storage]) as bag:
         for robot in range(setpoints.heading.shape[1]):
             for topic, message in (

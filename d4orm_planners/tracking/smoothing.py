@@ -28,14 +28,10 @@ from d4orm_planners.tracking.steering import present_velocities
 
 SMOOTHNESS = (1e-2, 1e-1, 1.0, 1e1, 1e2)
 """Weights of the squared third differences of a curve's coefficients, against the squared distances from the plan."""
-GATHERING, SETTLING = 2, 5
-"""Steps before a plan from rest in which the team starts, and after the last arrival in which it comes to rest."""
-PER_STEP = 32
-"""Samples per step at which a motion's speeds, accelerations and jerks are checked."""
-RESERVE = 1e-3
-"""Share of the limits that is left for peaks between these samples."""
-SLOWEST = 4.0
-"""Longest duration of a motion, in durations of the plan."""
+GATHERING, SETTLING = 2, 5  #: Steps before a plan from rest to start in, and after the last arrival to come to rest in
+PER_STEP = 32  #: Samples per step at which a motion's speeds, accelerations and jerks are checked
+RESERVE = 1e-3  #: Share of the limits that is left for peaks between these samples
+SLOWEST = 4.0  #: Longest duration of a motion, in durations of the plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +49,7 @@ class MotionLimits:
 
     @classmethod
     def of(cls, problem: Problem, acceleration: ArrayLike | None = None, jerk: ArrayLike | None = None) -> MotionLimits:
-        """The team's own limits, but for those that are given.
-
-        Raises:
-            ValueError: If one is not positive, or neither one number nor one per robot.
-        """
+        """The team's own limits, but for those given; ValueError unless one positive number, or one per robot."""
         team, rows = problem.team, []
         for model, limits in zip(team.robot_models, team.limits.astype(np.float64), strict=True):
             own, lower = dict(zip(model.limit_names, limits.tolist(), strict=False)), model.lower_bounds(limits)

@@ -10,8 +10,7 @@ from scipy.sparse.linalg import splu
 from d4orm_env.core.arrays import Floats
 
 DEGREE = 5
-NODES = 3
-"""Points of Gauss and Legendre's quadrature in a step."""
+NODES = 3  #: Points of Gauss and Legendre's quadrature in a step
 
 
 def fit_spline(values: Floats, velocity: Floats, dt: float, smoothness: float) -> BSpline:

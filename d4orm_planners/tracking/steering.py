@@ -21,8 +21,7 @@ from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.paths.shortest_paths import along_paths
 
 Rows = TypeVar("Rows", FloatArray, Floats)
-Columns: TypeAlias = tuple[FloatArray, ...]
-"""Components of the states, velocities, controls or limits of some robots."""
+Columns: TypeAlias = tuple[FloatArray, ...]  #: Components of the states, velocities, controls or limits of some robots
 
 if TYPE_CHECKING:
     from d4orm_env.engine import threads as thread_counts
@@ -31,10 +30,8 @@ else:
     thread_counts = LazyModule("d4orm_env.engine.threads")
     drive_kernels = LazyModule("d4orm_planners.tracking.tracker")
 
-CREEPING = np.float32(2.0**-20)
-"""Share of its speed limit with which a robot at its goal heads for its goal heading: it turns in place."""
-NEAR_VIA = 10 / 3
-"""Distance to a point on its way at which a robot turns to its goal, in radii of the largest robot."""
+CREEPING = np.float32(2.0**-20)  #: Share of its speed with which a robot at its goal turns to its heading
+NEAR_VIA = 10 / 3  #: Distance to a point on its way at which a robot turns to its goal, in radii of the largest robot
 
 
 def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
@@ -91,9 +88,7 @@ def limited_states(problem: Problem, states: FloatArray) -> FloatArray:
 
 
 def advanced(problem: Problem, states: FloatArray, controls: FloatArray) -> FloatArray:
-    """``(..., K, n)`` states a time step later, of robots that do not dock, under controls ``(..., K, m)`` within the
-    limits.
-    """
+    """``(..., K, n)`` states a step later, of robots that do not dock, under controls ``(..., K, m)`` in the limits."""
     return limited_states(problem, integrated(problem, states, controls))
 
 
@@ -153,9 +148,7 @@ def rates(problem: Problem, states: FloatArray, controls: FloatArray) -> FloatAr
 
 
 def _by_rows(problem: Problem, width: int, rows: tuple[FloatArray, ...], law: Callable[..., Columns]) -> FloatArray:
-    """``(..., K, width)`` results of ``law(functions, *rows, limits)`` for the rows ``(..., K, n)`` of every robot,
-    padded with zeros.
-    """
+    """``(..., K, width)`` results of ``law(functions, *rows, limits)`` for all robots' rows ``(..., K, n)``."""
     results = np.zeros((*rows[0].shape[:-1], width), np.float32)
     for model, robots in by_model(problem):
         columns = (tuple(np.moveaxis(part[..., robots, :], -1, 0)) for part in (*rows, problem.team.limits))
@@ -178,12 +171,8 @@ def must_brake(problem: Problem, states: FloatArray, controls: FloatArray, goals
 def braking_share(problem: Problem, velocities: Floats, accelerations: Floats) -> float:
     """Share of its pace that a team on its way can give up in a step, so that no robot need brake harder than it can.
 
-    Where a robot brakes anyway, it is down to half of that. Models without inertia stop at once.
-
-    Args:
-        problem: The robots.
-        velocities: ``(K, d)`` of their way at full pace [m/s].
-        accelerations: ``(K, d)`` likewise [m/s^2].
+    At full pace it has ``velocities`` [m/s] and ``accelerations`` [m/s^2] ``(K, d)``. Where a robot brakes anyway it
+    is down to half of that. Models without inertia stop at once.
     """
     team, inertia = problem.team, [not model.first_order for model in problem.team.robot_models]
     speeds, can = np.linalg.norm(velocities, axis=1), team.max_acceleration * problem.dt
@@ -210,7 +199,6 @@ def by_model(problem: Problem) -> Iterator[tuple[Model, list[int]]]:
 
 @lru_cache(maxsize=64)
 def _robots_by_name(models: tuple[str, ...]) -> tuple[tuple[str, tuple[int, ...]], ...]:
-    """Return the names of the models of a team, each with its robots."""
     own = {name: tuple(k for k, model in enumerate(models) if model == name) for name in dict.fromkeys(models)}
     return tuple(own.items())
 

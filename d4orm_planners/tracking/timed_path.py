@@ -19,10 +19,8 @@ from d4orm_planners.tracking.path_drives import BRAKING, RESERVE, Corners, Route
 from d4orm_planners.tracking.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
 from d4orm_planners.tracking.tracker import tracker
 
-HURRYING = 0.85
-"""Share of its acceleration that a robot counts on that hurries: if it leaves its route so, it drives by the clock."""
-NEAR, SHORT = 2 / 15, 2 / 3
-"""Distance at which a robot has reached a corner or stop, and length of a path to a stop that it may drive [radii]."""
+HURRYING = 0.85  #: Share of its acceleration that a robot in a hurry counts on; off its route it goes by the clock
+NEAR, SHORT = 2 / 15, 2 / 3  #: Distance at which corners and stops are reached; length of a drive to a stop [radii]
 
 
 class Timed(NamedTuple):

@@ -11,9 +11,7 @@ from d4orm_env.engine.choice import get_engine
 from d4orm_env.footprints import Box
 from d4orm_planners import run_episode
 from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
-from d4orm_planners.tracking.free_curves import free_curves
-from d4orm_planners.tracking.goal_drives import drive_to_goal
-from d4orm_planners.tracking.pose_curves import CUSP, STRAIGHT, curves, first_stretches
+from d4orm_planners.tracking.goal_drives import CUSP, STRAIGHT, curves, drive_to_goal, first_stretches, free_curves
 from d4orm_planners.tracking.steering import preferred_velocities, track_velocities
 
 CARS = ("car", "car_first_order", "car_with_1_trailer", "car_with_3_trailers")

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from d4orm_planners.base.candidate import Graph, components, conflicts, graph_of
-from d4orm_planners.d4orm_d.decoupling import Grouping, failure_groups, reconnected, regrouped
-from d4orm_planners.d4orm_d.repairs import independent_robots
+from d4orm_planners.d4orm_d.decoupling import Grouping, failure_groups, independent_robots, reconnected, regrouped
 
 MAX_ROBOTS = 7
 

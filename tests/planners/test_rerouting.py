@@ -19,7 +19,7 @@ from d4orm_planners import make_planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine import path_index
-from d4orm_planners.hybrid.rerouting import reroute
+from d4orm_planners.hybrid.planner import reroute
 from d4orm_planners.mapf import beam_search
 from d4orm_planners.tracking.steering import straight_drives
 

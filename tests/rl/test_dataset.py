@@ -18,9 +18,9 @@ from d4orm_env import make_problem, navigation_v0
 from d4orm_env.disturbances import Delay, Push, StateNoise
 from d4orm_planners import Policy, make_policy
 from d4orm_planners.base.policy import GoToGoal
+from d4orm_planners.evaluation.pool import only_writer
 from d4orm_planners.rl.dataset import Demonstrations, RecordedEpisode, record_episode, write_dataset
 from d4orm_planners.rl.dataset import write as write_module
-from d4orm_planners.rl.only_writer import only_writer
 
 minari = pytest.importorskip("minari")
 

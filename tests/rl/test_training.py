@@ -56,7 +56,7 @@ def test_stages_take_whole_updates_and_all_of_them() -> None:
 
 
 pytest.importorskip("stable_baselines3")
-from d4orm_planners.rl.only_writer import only_writer  # noqa: E402
+from d4orm_planners.evaluation.pool import only_writer  # noqa: E402
 from d4orm_planners.rl.training import TrainingSettings, train  # noqa: E402
 
 TINY = TrainingSettings(

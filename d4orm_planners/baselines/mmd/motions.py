@@ -26,10 +26,8 @@ from d4orm_env.paths.spaces import Space, clearance_at
 from d4orm_planners.baselines.mmd.path_frame import PathFrame, locate, segment_length, trace
 from d4orm_planners.tracking.tracker import tracker
 
-SHARE = 0.7
-"""Share of its acceleration that a robot counts on, so that it can make up for what it is off."""
-GAIN = np.float32(1.5)
-"""Share of its distance from the motion that a robot makes up for in a second [1/s]."""
+SHARE = 0.7  #: Share of its acceleration that a robot counts on, so that it can make up for what it is off
+GAIN = np.float32(1.5)  #: Share of its distance from the motion that a robot makes up for in a second [1/s]
 _PROBE, _WITHIN = 1 / 150, 2.0**-27
 """Distance over which the slope of the clearance is measured, in radii of the largest robot, and share of a sphere's
 radius within which no direction leads out of it."""

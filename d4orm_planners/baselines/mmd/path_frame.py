@@ -19,20 +19,13 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 from d4orm_env.paths.spaces import Space, clearance_at, make_space
 
-POINTS = 64
-"""Stretches of equal time that a motion is cut into, as in the publication."""
-MODES = 16
-"""Sines that a difference from the path is made of."""
-LOOKS = 16
-"""Points along the path at which the model gets the path and the clearances on both sides of it."""
-FEATURES = 5 * LOOKS + 2
-"""Numbers that the model is told."""
-_ROUNDING = 2
-"""Points before and after one over which a path's direction is averaged."""
-_ANY = 1e6
-"""Rate at which robots that take any velocity at once could reach their full speed [1/s]."""
-_FAR = 4.0
-"""Largest clearance that the model is told of, in safety distances."""
+POINTS = 64  #: Stretches of equal time that a motion is cut into, as in the publication
+MODES = 16  #: Sines that a difference from the path is made of
+LOOKS = 16  #: Points along the path at which the model gets the path and the clearances on both sides of it
+FEATURES = 5 * LOOKS + 2  #: Numbers that the model is told
+_ROUNDING = 2  #: Points before and after one over which a path's direction is averaged
+_ANY = 1e6  #: Rate at which robots that take any velocity at once could reach their full speed [1/s]
+_FAR = 4.0  #: Largest clearance that the model is told of, in safety distances
 
 
 class PathFrame(NamedTuple):
@@ -86,9 +79,7 @@ def world_space(problem: Problem) -> Space:
 
 
 def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> PathFrame | None:
-    """The frame of a robot, ``None`` if it has no path to its goal; in space ``turn`` ``(3,)``, any vector, chooses its
-    axes.
-    """
+    """A robot's frame, ``None`` if it has no path to its goal; in space any ``turn`` ``(3,)`` chooses its axes."""
     corners = problem.shortest_paths.path(robot)
     if not len(corners):
         return None

@@ -33,11 +33,8 @@ from d4orm_planners.baselines.mmd.path_frame import PathFrame, make_frame, world
 from d4orm_planners.baselines.mmd.prior import Batch, Denoiser
 from d4orm_planners.mapf.planner import NoPaths
 
-SLACK = 1 / 75
-"""Added to distances when conflicts are sought, for rounding, in radii of the largest robot."""
-PADDING = 2
-"""Number of a motion's 64 points by which a constraint outlasts its conflict on either side, as published."""
-
+SLACK = 1 / 75  #: Added to distances when conflicts are sought, for rounding, in radii of the largest robot
+PADDING = 2  #: Number of a motion's 64 points by which a constraint outlasts its conflict on either side, as published
 Stretch = Annotated[Number, Field(ge=1, le=100)]
 
 
@@ -84,9 +81,7 @@ class Planning:
         self.steps = 0
 
     def root(self, seeds: list[int], should_stop: Callable[[], bool] = lambda: False) -> TreeNode | None:
-        """All robots' motions, one after another around those that have planned (soft constraints only); ``None`` if it
-        should stop before the last.
-        """
+        """All motions, each around those that have planned (soft constraints only); ``None`` if it should stop."""
         motions: list[RobotMotion] = []
         for robot, seed in enumerate(seeds):
             if should_stop():
@@ -215,7 +210,6 @@ class MMD(Planner):
 
 
 def _begin(search: SolveRun) -> Tree | NoPaths:
-    """The tree before its root."""
     problem, space = search.problem, world_space(search.problem)
     reason = NoPaths.unless_reachable(search)
     if reason is not None:

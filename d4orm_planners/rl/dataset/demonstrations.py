@@ -11,9 +11,10 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from pettingzoo import ParallelEnv
 
 from d4orm_env import __version__, navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, check_choice, plain_number, short_repr, truth
@@ -24,40 +25,21 @@ from d4orm_env.core.seeds import checked_seeds
 from d4orm_env.disturbances.disturbance import Disturbance
 from d4orm_env.envs.team_step import TeamStep
 from d4orm_planners.base.episode import run_episode
-from d4orm_planners.base.planner_registry import PolicyLike, origin, policy_settings
+from d4orm_planners.base.planner_registry import PolicyLike, fresh_policy, origin, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, Policy, robot_indices
-from d4orm_planners.base.policy_copies import fresh_policy
 from d4orm_planners.evaluation.trials import Condition
 
-if TYPE_CHECKING:
-    from pettingzoo import ParallelEnv
-
-AGENTS = ("team", "robot")
-"""Owner of an episode of a dataset."""
-
-MAX_BYTES = 2**31
-"""Largest array of an episode that is read."""
+AGENTS = ("team", "robot")  #: Owner of an episode of a dataset
+MAX_BYTES = 2**31  #: Largest array of an episode that is read
 UNREADABLE = (ValueError, KeyError, EOFError, RecursionError, zipfile.BadZipFile, zlib.error)
 """Errors of reading arrays from a file that holds something else."""
 _FLAGS = ("acting", "terminations", "arrived", "collided", "margin_violated")
-_OF_STEPS = ("actions", "acting", "rewards", "terminations")
-"""Arrays of ``T`` moments; the others have one more."""
+_OF_STEPS = ("actions", "acting", "rewards", "terminations")  #: Arrays of ``T`` moments; the others have one more
 
 
 @dataclass(frozen=True, kw_only=True)
 class Demonstrations:
     """Episodes of a policy to be recorded.
-
-    Attributes:
-        policy: The policy, as for :func:`~d4orm_planners.make_policy`.
-        settings: Of the policy, ``time_limit`` and ``preset`` of a planner among them.
-        environment: Arguments of :class:`~d4orm_env.navigation_v0.parallel_env`, as ``{"scenario": "random",
-            "num_robots": 8}``.
-        seeds: One episode each: the environment is reset with the seed, which draws the instance where the scenario
-            draws, and so is the policy.
-        agents: Owner of an episode of the dataset: ``"team"``, with the spaces of the joint environment, or
-            ``"robot"``, one for each robot with its own.
-        only_success: Leave out episodes in which a robot touches anything or does not arrive.
 
     Raises:
         ValueError: For an unknown name, a setting or argument that makes no sense, or seeds that are none.
@@ -65,12 +47,18 @@ class Demonstrations:
         ImportError: If the policy needs a library that is not installed.
     """
 
-    policy: PolicyLike = "d4orm-c2f"
+    policy: PolicyLike = "d4orm-c2f"  #: The policy, as for :func:`~d4orm_planners.make_policy`
+    #: Of the policy, ``time_limit`` and ``preset`` of a planner among them
     settings: Mapping[str, object] = field(default_factory=dict)
+    #: Arguments of :class:`~d4orm_env.navigation_v0.parallel_env`, as ``{"scenario": "random", "num_robots": 8}``
     environment: Mapping[str, Any] = field(default_factory=dict)
+    #: One episode each: the environment is reset with the seed, which draws the instance where the scenario draws, and
+    #: so is the policy
     seeds: Iterable[int] = range(100)
+    #: Owner of an episode of the dataset: ``"team"``, with the spaces of the joint environment, or ``"robot"``, one for
+    #: each robot with its own
     agents: str = "team"
-    only_success: bool = False
+    only_success: bool = False  #: Leave out episodes in which a robot touches anything or does not arrive
     _source: Any = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -90,17 +78,14 @@ class Demonstrations:
             env.unwrapped.options.require_physical_units()
 
     def make_env(self) -> ParallelEnv:
-        """A new environment to record in."""
         return navigation_v0.parallel_env(**self.environment)
 
     def record(self, seed: int) -> RecordedEpisode:
-        """The episode of a seed."""
         with closing(self.make_env()) as env:
             return record_episode(env, fresh_policy(self._source, **self.settings), seed)
 
     @property
     def policy_name(self) -> str:
-        """Name of the policy."""
         policy = self.policy
         return policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
 
@@ -197,7 +182,6 @@ _ARRAYS = tuple(field.name for field in fields(RecordedEpisode) if field.name !=
 
 
 def _check(arrays: Mapping[str, np.ndarray], metadata: object) -> None:
-    """Refuse what is no episode, in types or shapes."""
     actions = arrays["actions"]
     if actions.ndim != 3 or not isinstance(metadata, dict) or not isinstance(metadata.get("seed"), int):
         raise ValueError("it lacks a seed, or actions of every robot at every step")

@@ -57,7 +57,6 @@ class DatasetFiles:
         return sorted(path for path in (self.folder / "shards").glob("*") if path.name.isdecimal())
 
     def seeds(self) -> set[int]:
-        """Return the seeds of the episodes that are in shards."""
         return {int(seed) for shard in self.shards for seed in _metadata(shard)["recorded_seeds"]}
 
     def add_shard(self, episodes: Sequence[RecordedEpisode]) -> None:
@@ -169,7 +168,6 @@ class Samples:
 
     @classmethod
     def joined(cls, parts: Sequence[Samples]) -> Self:
-        """All of them, in order."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS))
 
     def learnable(self, features: Features) -> tuple[FloatArray, FloatArray]:

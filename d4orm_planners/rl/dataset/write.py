@@ -27,18 +27,15 @@ from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
 from d4orm_env.envs.joint_env import ENV_ID, JointNavigationEnv
 from d4orm_planners.base.provenance import commit, versions
-from d4orm_planners.evaluation.pool import ProcessWorker, run_here, run_jobs
+from d4orm_planners.evaluation.pool import ProcessWorker, only_writer, run_here, run_jobs
 from d4orm_planners.rl.dataset.demonstrations import Demonstrations, RecordedEpisode
 from d4orm_planners.rl.dataset.minari_files import DatasetFiles
-from d4orm_planners.rl.only_writer import only_writer
 
 if TYPE_CHECKING:
     from minari import MinariDataset
 
 IDENTITY = "demonstrations.json"
-_WHOLE, _DROPPED = "npz", "dropped"
-"""Kinds of files of episodes: recorded, and left out."""
-
+_WHOLE, _DROPPED = "npz", "dropped"  #: Kinds of files of episodes: recorded, and left out
 minari: Any = LazyModule("minari", "a dataset", "dataset")
 minari_dataset: Any = LazyModule("minari.dataset.minari_dataset", "a dataset", "dataset")
 datasets_root_dir: Any = LazyModule("minari.storage.datasets_root_dir", "a dataset", "dataset")
@@ -57,11 +54,9 @@ class Recording:
         return {int(path.stem) for path in self.folder.glob(f"*.{kind}") if path.stem.isdecimal()}
 
     def path(self, seed: int, kind: str = _WHOLE) -> Path:
-        """File of the episode of a seed."""
         return self.folder / f"{seed}.{kind}"
 
     def forget(self, seed: int) -> None:
-        """Remove the episode of a seed."""
         self.path(seed).unlink(missing_ok=True)
 
 
@@ -75,7 +70,6 @@ class _Task:
     num_parts: int = 1
 
     def run(self) -> Iterator[tuple[int, str]]:
-        """Record it."""
         try:
             episode = self.demonstrations.record(self.seed)
         except Exception as error:  # whatever a policy raises
@@ -205,7 +199,6 @@ def _record(
 
 
 def _pack(recording: Recording, files: DatasetFiles, shard_size: int) -> None:
-    """Move what has been recorded into shards, by seed."""
     seeds = sorted(recording.seeds())
     for begin in range(0, len(seeds), shard_size):
         part = seeds[begin : begin + shard_size]
