@@ -37,6 +37,8 @@ Cars of CL-CBS's and CSDO's benchmarks, planned by what `make_planner()` gives.
 
 A row for each map's kind and number of cars, of the first files of each folder; else as in the study `dynobench`."""
 """Description of the study of cars."""
+LACAM = "db-lacam"
+"""Folder of db-LaCAM's files."""
 LIMIT = 60.0
 """Time to plan [s]."""
 RIVAL = Path(__file__).parent / "data" / "db_cbs.csv"
@@ -86,8 +88,12 @@ def main() -> None:
     # Without the number of one that was drawn.
     accepted = [row | {"kind": re.sub(r"(_n\d+)_\d+", r"\1", row["instance"])} for row in rows if not row["refused"]]
     kinds = grouped(accepted, "benchmark", "kind")
-    table = [described(*kind, own) | beside_rival(own) for kind, own in kinds.items()]
-    save_table(table, arguments.out / "dynobench.csv")
+    # A table each: their stored seconds are of different machines.
+    for name, is_lacam in (("dynobench", False), ("dynobench_db_lacam", True)):
+        own = {kind: rows for kind, rows in kinds.items() if (kind[0] == LACAM) == is_lacam}
+        if own:
+            table = [described(*kind, rows) | ({} if is_lacam else beside_rival(rows)) for kind, rows in own.items()]
+            save_table(table, arguments.out / f"{name}.csv")
 
 
 def beside_rival(rows: list[dict[str, Any]]) -> dict[str, str]:
