@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -259,7 +259,7 @@ def _rounded_up(distance: float) -> float:
 
 
 def _polygons(given: Sequence[ArrayLike]) -> tuple[FloatArray, ...]:
-    if not isinstance(given, Iterable):
+    if not isinstance(given, Iterable) or isinstance(given, str | bytes | Mapping):
         raise ValueError(f"polygons must be a list of polygons, each a list of corners, not {short_repr(given)}")
     corners = (frozen_array(one, f"polygons[{index}]", (None, 2), largest=LARGEST) for index, one in enumerate(given))
     return tuple(corners)

@@ -389,8 +389,9 @@ def test_trailers_in_a_file_are_a_list(trailers: object) -> None:
 def test_what_is_no_team_or_no_polygon_is_told() -> None:
     with pytest.raises(ValueError, match=r"team is 5; give a Team, as make_team\(\) returns"):
         Problem(5, [[0]], [[0]])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="polygons must be a list of polygons, each a list of corners, not 5"):
-        World(polygons=5)  # type: ignore[arg-type]
+    for polygons, told in ((5, "5"), ("", "''"), ({}, "{}")):
+        with pytest.raises(ValueError, match=f"polygons must be a list of polygons, each a list of corners, not {told}"):
+            World(polygons=polygons)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32, np.int64, int])
