@@ -10,6 +10,7 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Any
 
+from sphinx.ext.napoleon import GoogleDocstring
 from sphinx.pycode import ModuleAnalyzer
 
 HERE = Path(__file__).resolve().parent
@@ -71,6 +72,8 @@ autodoc_mock_imports = [
 napoleon_use_ivar = True
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
+# Else what is before a colon in the description of an attribute would be taken for its type.
+GoogleDocstring._parse_attribute_docstring = GoogleDocstring._consume_to_end
 
 # The modules' pages are not in the navigation: with hundreds of entries it is most of every page and of the build.
 suppress_warnings = ["toc.not_included"]
