@@ -179,7 +179,8 @@ class EnvSetup:
             )
         if self.along_paths:
             drawn.shortest_paths.check_reachable()
-        names = set(drawn.arrays._fields) - {*OWN_ARRAYS, *_WORLD_ARRAYS, "grid", "footprints"} if self._batched else ()
+        own = {*OWN_ARRAYS, *_WORLD_ARRAYS, "grid", "footprints"}
+        names = [name for name in drawn.arrays._fields if name not in own] if self._batched else ()
         differing = self.differing(drawn, names)
         if differing:
             raise ValueError(

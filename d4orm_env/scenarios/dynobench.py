@@ -224,6 +224,18 @@ def _turn_as_theirs(headings: Floats, rates: Floats) -> None:
             headings[step] = math.copysign(HALF_TURN, theirs)
 
 
+def _executed(model: Model, dt: float, states: Floats, controls: FloatArray) -> Floats:
+    """Actions that lead from each state to the next: accelerations less what the limit of the speed swallows."""
+    actions = controls[:, : model.control_size].astype(np.float64)
+    angles = {model.heading_index, *(hitch for hitch, _ in model.trailers)}
+    rates = [index for index in range(model.dimension, model.state_size) if index not in angles]
+    if len(rates) == model.control_size:
+        executed = np.diff(states[:, rates], axis=0) / dt
+        swallowed = abs(executed - actions) > GOAL_TOLERANCE
+        actions[swallowed] = executed[swallowed]
+    return actions
+
+
 def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
     """The lines of a result file: states and actions of every robot, until it rests at its goal for good."""
     known = {ours: theirs for theirs, ours in kinds.DYNAMICS.items()}
@@ -250,6 +262,7 @@ def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
         if model.name == "unicycle2":
             _turn_as_theirs(states[:, model.heading_index], states[:, model.state_names.index("turn_rate")])
         yield "-"
-        for name, rows in (("states", states), ("actions", trajectory.controls[:last, robot, : model.control_size])):
+        actions = _executed(model, problem.dt, states, trajectory.controls[:last, robot])
+        for name, rows in (("states", states), ("actions", actions)):
             yield f"  {name}:" if len(rows) else f"  {name}: []"
             yield from (f"    - [{', '.join(f'{value:.7g}' for value in row)}]" for row in rows)

@@ -256,7 +256,7 @@ def test_teams_of_a_batch_are_alike() -> None:
     def sizes(seed: int, num_robots: int) -> Problem:
         return Problem(Team(("velocity2d",), radius=0.1 + 0.1 / (1 + seed)), [[0, 0]], [[1, 0]])
 
-    with pytest.raises(ValueError, match="instances of scenario 'sizes' differ in their radius"):
+    with pytest.raises(ValueError, match="instances of scenario 'sizes' differ in their radius, wall_radius,"):
         gymnasium.make_vec(
             "d4orm/Navigation-v0", num_envs=2, vectorization_mode="vector_entry_point", scenario=sizes, num_robots=1
         )
