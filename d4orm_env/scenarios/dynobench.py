@@ -25,6 +25,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
+from d4orm_env.dynamics.first_order_cars import WHEELBASE
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.footprints import Box, Disc
@@ -39,6 +40,8 @@ SLOWEST = 10
 LEAST_STEPS = 300
 HALF_TURN, FLOAT32_ERROR = 3.14159, 1e-6
 """Largest heading that is written: not beyond pi when it is read in float32, and how exactly that is then [rad]."""
+BESIDE_HALF_TURN = 2 * GOAL_TOLERANCE
+"""How near to that headings are which may stand for it; their checkers allow twice that from step to step [rad]."""
 
 KEYS, ROBOT_KEYS = ("min", "max", "obstacles"), ("type", "start", "goal")
 """Keys of their environments and robots that are read. One that looks like one of these is an error, all others are
@@ -213,15 +216,39 @@ def _check_mapping(entry: Any, what: str, *names: str) -> Any:
     return entry
 
 
-def _turn_as_theirs(headings: Floats, rates: Floats) -> None:
-    """Put headings ``(T,)`` where their Euler steps pass pi and ours do not, or the other way round, just beside pi."""
-    for step in range(1, len(headings)):
-        theirs = math.remainder(headings[step - 1] + DT * rates[step], math.tau)
+def _turn_rates(model: Model, limits: FloatArray, states: Floats, actions: Floats) -> Floats:
+    """``(T, A)`` rates of a robot's heading and of its trailers' by which their Euler steps turn these [rad/s]."""
+    if model.name == "unicycle2":
+        return states[1:, [model.state_names.index("turn_rate")]]
+    if not model.trailers:
+        return actions[:, [1]]
+    speed = actions[:, 0]
+    rates = [speed * np.tan(actions[:, 1]) / limits[WHEELBASE]]
+    for hitch, length in model.trailers:
+        bend = states[:-1, hitch - 1] - states[:-1, hitch]
+        rates.append(speed * np.sin(bend) / limits[length])
+        speed = speed * np.cos(bend)
+    return np.stack(rates, axis=1)
+
+
+def _turn_as_theirs(headings: Floats, rates: Floats, end: float) -> None:
+    """Put headings ``(T + 1,)`` where Euler steps pass pi and ours do not, or the other way round, just beside pi.
+
+    The last is to be on the same side as ``end`` (NaN for none), which they compare it with.
+    """
+    for step, turn in enumerate(DT * rates, 1):
+        theirs = math.remainder(headings[step - 1] + turn, math.tau)
         if np.pi - abs(theirs) < FLOAT32_ERROR:  # either side of pi for them
             headings[step - 1] -= math.copysign(10 * FLOAT32_ERROR, headings[step - 1])
-            theirs = math.remainder(headings[step - 1] + DT * rates[step], math.tau)
-        if abs(theirs - headings[step]) > np.pi and HALF_TURN - abs(headings[step]) < GOAL_TOLERANCE / 2:
+            theirs = math.remainder(headings[step - 1] + turn, math.tau)
+        if abs(theirs - headings[step]) > np.pi and HALF_TURN - abs(headings[step]) < BESIDE_HALF_TURN:
             headings[step] = math.copysign(HALF_TURN, theirs)
+    if len(rates) and abs(headings[-1] - end) > np.pi and HALF_TURN - abs(headings[-1]) < BESIDE_HALF_TURN:
+        side, before = math.copysign(1.0, end), headings[-2]
+        # From where they do not pass pi, though a trailer that is turned back swings a little more.
+        latest = HALF_TURN - max(side * DT * rates[-1], 0.0) - GOAL_TOLERANCE / 10
+        if 0 < side * before < latest + BESIDE_HALF_TURN:
+            headings[-1], headings[-2] = side * HALF_TURN, side * min(side * before, latest)
 
 
 def _executed(model: Model, dt: float, states: Floats, controls: FloatArray) -> Floats:
@@ -253,16 +280,19 @@ def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
         moving = ~trajectory.arrived[:, robot] | unlike.any(axis=1)
         last = int(np.flatnonzero(moving)[-1]) + 1 if moving.any() else 0
         states = states[: last + 1]
-        for hitch, _ in model.trailers:
-            states[:, hitch] = states[:, hitch - 1] - states[:, hitch]
+        for hitch, length in model.trailers:
+            most = problem.team.limits[robot, length - 1] - 2 * FLOAT32_ERROR  # its limit, whatever writing adds
+            states[:, hitch] = states[:, hitch - 1] - np.clip(states[:, hitch], -most, most)
+        actions = _executed(model, problem.dt, states, trajectory.controls[:last, robot])
         if model.heading_index is not None:
             turned = [model.heading_index, *(hitch for hitch, _ in model.trailers)]
             # Not beyond pi as it is written: their checker would turn that round.
             states[:, turned] = np.minimum(_wrapped(states[:, turned]), HALF_TURN)
-        if model.name == "unicycle2":
-            _turn_as_theirs(states[:, model.heading_index], states[:, model.state_names.index("turn_rate")])
+            rates = _turn_rates(model, problem.team.limits[robot], states, actions)
+            ends = _wrapped(problem.goal_heading[robot] - np.append(0.0, np.cumsum(problem.goal_hitches[robot])))
+            for angle, own_rates, end in zip(turned, rates.T, ends.tolist(), strict=False):
+                _turn_as_theirs(states[:, angle], own_rates, end)
         yield "-"
-        actions = _executed(model, problem.dt, states, trajectory.controls[:last, robot])
         for name, rows in (("states", states), ("actions", actions)):
             yield f"  {name}:" if len(rows) else f"  {name}: []"
             yield from (f"    - [{', '.join(f'{value:.7g}' for value in row)}]" for row in rows)
