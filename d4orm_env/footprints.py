@@ -98,13 +98,9 @@ class Footprint(ABC):
 
 @dataclass(frozen=True)
 class Disc(Footprint):
-    """A disc, or a ball in space.
+    """A disc, or a ball in space."""
 
-    Attributes:
-        radius: Radius [m].
-    """
-
-    radius: float
+    radius: float  #: Radius [m]
 
     @property
     def outer_radius(self) -> float:
@@ -157,17 +153,12 @@ class Planar(Footprint):
 
 @dataclass(frozen=True)
 class Box(Planar):
-    """A rectangle, its length along the heading.
+    """A rectangle, its length along the heading."""
 
-    Attributes:
-        length: Along the heading [m].
-        width: Across it [m].
-        offset: How far ahead of the reference point its centre lies [m]; half of the length less the rear overhang
-            for a car, whose reference point is its rear axle.
-    """
-
-    length: float
-    width: float
+    length: float  #: Along the heading [m]
+    width: float  #: Across it [m]
+    #: How far ahead of the reference point its centre lies [m]; half of the length less the rear overhang for a car,
+    #: whose reference point is its rear axle
     offset: float = 0.0
 
     @property
@@ -179,17 +170,11 @@ class Box(Planar):
 
 @dataclass(frozen=True)
 class Capsule(Planar):
-    """A rectangle with round ends: all within a radius of a segment along the heading.
+    """A rectangle with round ends: all within a radius of a segment along the heading."""
 
-    Attributes:
-        length: Length of the segment [m]; with both ends the capsule is longer by twice the radius.
-        radius: Half of its width [m].
-        offset: How far ahead of the reference point its centre lies [m].
-    """
-
-    length: float
-    radius: float
-    offset: float = 0.0
+    length: float  #: Length of the segment [m]; with both ends the capsule is longer by twice the radius
+    radius: float  #: Half of its width [m]
+    offset: float = 0.0  #: How far ahead of the reference point its centre lies [m]
 
     @property
     def core(self) -> Core:
@@ -201,13 +186,11 @@ class Capsule(Planar):
 class Polygon(Planar):
     """A convex polygon.
 
-    Attributes:
-        corners: ``(n, 2)``, three to eight corners in order, either way round, x along the heading [m].
-
     Raises:
         ValueError: If there are fewer or more, two coincide, or the polygon is not convex.
     """
 
+    #: ``(n, 2)``, three to eight corners in order, either way round, x along the heading [m]
     corners: tuple[tuple[float, float], ...]
 
     def __init__(self, corners: ArrayLike) -> None:
@@ -242,19 +225,14 @@ class Ellipsoid(Footprint):
     With a ``body``, the ellipsoid is for other robots only, whatever their footprints. Obstacles, moving ones too, and
     bounds meet the ball of that radius.
 
-    Attributes:
-        x: Semi-axis along x [m].
-        y: Semi-axis along y [m].
-        z: Semi-axis along z [m].
-        body: Radius of the ball in it that obstacles and bounds meet [m]; ``None`` if they meet the ellipsoid.
-
     Raises:
         ValueError: If a size is no positive number, or the body is larger than a semi-axis.
     """
 
-    x: float
-    y: float
-    z: float
+    x: float  #: Semi-axis along x [m]
+    y: float  #: Semi-axis along y [m]
+    z: float  #: Semi-axis along z [m]
+    #: Radius of the ball in it that obstacles and bounds meet [m]; ``None`` if they meet the ellipsoid
     body: float | None = None
     dimension = 3
 
@@ -305,16 +283,12 @@ class Ellipsoid(Footprint):
 class Train(Footprint):
     """A robot with trailers, each a planar footprint about its own reference point: a trailer's axle.
 
-    Attributes:
-        front: Of the robot itself.
-        trailers: From the front on.
-
     Raises:
         ValueError: If one of them is no planar footprint, or the trailers are none or no sequence.
     """
 
-    front: Disc | Planar
-    trailers: tuple[Disc | Planar, ...]
+    front: Disc | Planar  #: Of the robot itself
+    trailers: tuple[Disc | Planar, ...]  #: From the front on
 
     def __init__(self, front: Disc | Planar, trailers: Sequence[Disc | Planar]) -> None:
         if isinstance(trailers, str) or not isinstance(trailers, Sequence):
