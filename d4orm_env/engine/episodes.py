@@ -156,8 +156,7 @@ def advance_worlds_kernel(
         num_robots, dimension = arrays.goal.shape
         w = aligned_zeros(num_robots * STRIDE + pose_rows(arrays.footprints) * TILE)
         near, boxes = np.empty((num_robots, 3), np.uint64), allocate_boxes(arrays)
-        sensed = allocate_sensed(num_robots, 0, dimension, view)
-        arrays = borrow(arrays)  # the batch by value, which steps faster
+        sensed, arrays = allocate_sensed(num_robots, 0, dimension, view), borrow(arrays)  # a batch by value is quicker
         for index in range(tile_range[0], tile_range[1]):
             first, count = index * TILE, min(TILE, orders.shape[0] - index * TILE)
             moving, busy = _prepare_tile(batch, orders, first, count)

@@ -186,6 +186,7 @@ def _arrays(problem: Problem) -> ProblemArrays:
     )
     heading, tolerance = jnp.asarray(problem.goal_heading), jnp.asarray(problem.goal_heading_tolerance)
     angles = jnp.column_stack([heading, jnp.asarray(problem.goal_hitches)])
+    directions = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=2)
     gap2 = ((start[:, : team.dimension] - goal) ** 2).sum(axis=-1)
     distance = jnp.sqrt(jnp.maximum(gap2, goal_radius**2))
     if world.lower is None:
@@ -210,9 +211,7 @@ def _arrays(problem: Problem) -> ProblemArrays:
         "docks": problem.arrival == "dock",
         "collision_penalty": penalty,
         "turns_at_goals": True,
-        "goal_direction": jnp.nan_to_num(jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=2)).reshape(
-            len(angles), -1
-        ),
+        "goal_direction": jnp.nan_to_num(directions).reshape(len(angles), -1),
         "squared_goal_chord": jnp.where(jnp.isnan(heading), jnp.inf, 4 * jnp.sin(tolerance / 2) ** 2),
         "footprints": team.footprint_arrays,
         "wall_radius": jnp.asarray(team.wall_radius),

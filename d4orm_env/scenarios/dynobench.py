@@ -41,7 +41,7 @@ LEAST_STEPS = 300
 HALF_TURN, FLOAT32_ERROR = 3.14159, 1e-6
 """Largest heading that is written: not beyond pi when it is read in float32, and how exactly that is then [rad]."""
 BESIDE_HALF_TURN = 2 * GOAL_TOLERANCE
-"""How near to that headings are which may stand for it; their checkers allow twice that from step to step [rad]."""
+"""Distance to that within which headings may be written as it; their checkers allow twice that a step [rad]."""
 
 KEYS, ROBOT_KEYS = ("min", "max", "obstacles"), ("type", "start", "goal")
 """Keys of their environments and robots that are read. One that looks like one of these is an error, all others are
@@ -280,8 +280,8 @@ def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
         moving = ~trajectory.arrived[:, robot] | unlike.any(axis=1)
         last = int(np.flatnonzero(moving)[-1]) + 1 if moving.any() else 0
         states = states[: last + 1]
-        for hitch, length in model.trailers:
-            most = problem.team.limits[robot, length - 1] - 2 * FLOAT32_ERROR  # its limit, whatever writing adds
+        for hitch, _ in model.trailers:
+            most = problem.team.limits[robot, dict(model.state_limits)[hitch]] - 2 * FLOAT32_ERROR  # written as float32
             states[:, hitch] = states[:, hitch - 1] - np.clip(states[:, hitch], -most, most)
         actions = _executed(model, problem.dt, states, trajectory.controls[:last, robot])
         if model.heading_index is not None:

@@ -149,7 +149,7 @@ class ConvexBodies:
         return ConvexBodies(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def at_walls(self) -> ConvexBodies:
-        """What obstacles and bounds meet of bodies in space."""
+        """Return the bodies in space as obstacles and bounds meet them."""
         axes, outer = self.wall_axes, self.wall_axes.max(axis=1).astype(np.float32).astype(np.float64)
         return replace(self, semi_axes=axes, outer=outer, stretch=axes.max(axis=1) / axes.min(axis=1))
 

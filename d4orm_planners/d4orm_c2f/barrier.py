@@ -76,6 +76,15 @@ class Barriers(NamedTuple):
         return self.least - (self.normals * (padded[self.one] - padded[self.other])).sum(axis=1)
 
 
+def _steepest(normal: Floats, room: float, flat: Floats) -> tuple[Floats, float]:
+    """Unit vector along the steepest way out of an ellipsoid, a ball where ``flat``, and the room along it [m]."""
+    if flat[-1] == 1:
+        return normal, room
+    way = normal * flat * flat
+    length = float(np.linalg.norm(way))
+    return way / length, room / length
+
+
 def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, speed_slack: float) -> Barriers:
     d = problem.dimension
     positions = joint.states[:, :d].astype(np.float64)
@@ -101,10 +110,7 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
     separation = np.linalg.norm(offsets * flat, axis=2)
     for i, j in np.argwhere(np.triu((separation > 0) & (separation < near) & (free[:, None] | free))).tolist():
         normal, room = offsets[i, j] / separation[i, j], float(separation[i, j]) - radius[i] - radius[j] - gap
-        if flat[-1] < 1:  # along the steepest way out of the ellipsoid, and how far that is
-            normal = normal * flat * flat
-            length = float(np.linalg.norm(normal))
-            normal, room = normal / length, room / length
+        normal, room = _steepest(normal, room, flat)
         add(i if free[i] else -1, j if free[j] else -1, normal, room, braking[i] + braking[j])
     able = np.flatnonzero(free).tolist()
     for body in joint.bodies[joint.bodies[:, -1] > 0] if len(joint.bodies) else ():

@@ -62,7 +62,7 @@ Ending: TypeAlias = tuple[float, Whole, Whole]
 def _count_next(
     arrays: ProblemArrays, table: PathTable, queries: Queries, r: int, new: Branches, node: Whole, block: Whole
 ) -> float:
-    """What a path does wrong by itself in the block and, unless that is something, or was counted, whom it meets."""
+    """Faults of a path by itself in the block and, unless there are some, or it was counted, robots that it meets."""
     robot, (begin, end), faults = queries.robots[r], steps_of(table, block), 0.0
     read_positions(node % TILE, end - begin, new.lanes[node // TILE], new.path)
     if not new.counted[node, 0]:

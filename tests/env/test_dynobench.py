@@ -12,7 +12,7 @@ import yaml
 
 from d4orm_env import load_dynobench, load_problem, rollout, verify
 from d4orm_env.footprints import Box, Disc
-from d4orm_env.scenarios.dynobench import result_lines
+from d4orm_env.scenarios.dynobench import _turn_as_theirs, result_lines
 from d4orm_env.scenarios.dynobench_types import MODELS, checked_types
 from d4orm_planners import make_planner
 
@@ -89,6 +89,22 @@ def test_a_solution_passes_a_check_of_their_kind(instance: Path, tmp_path: Path)
             following[:, 2] = (following[:, 2] + np.pi) % (2 * np.pi) - np.pi
         gap = states[1:] - following
         assert np.abs(gap[:-1]).max() <= 0.0101  # the last one ends at rest
+
+
+@pytest.mark.parametrize(
+    ("headings", "rates", "end", "written"),
+    [
+        ([3.1, 3.1401, -3.1412], [0.4, 0.01], np.nan, [3.1, 3.1401, 3.14159]),  # theirs is at 3.1411
+        ([3.05, 3.1, -3.139], [0.5, 0.44], 3.14, [3.05, 3.09659, 3.14159]),  # and goals are compared without turns
+        ([3.05, 3.1, -3.1], [0.5, 0.83], 3.14, [3.05, 3.1, -3.1]),  # too far from there
+    ],
+)
+def test_headings_beside_half_a_turn_are_on_their_side(
+    headings: list[float], rates: list[float], end: float, written: list[float]
+) -> None:
+    found = np.array(headings)
+    _turn_as_theirs(found, np.array(rates), end)
+    np.testing.assert_allclose(found, written, atol=1e-9)
 
 
 @pytest.mark.parametrize(
