@@ -7,7 +7,7 @@ compiled loop; nothing returns to the host before it ends, or before the next lo
 from __future__ import annotations
 
 from functools import partial
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -47,44 +47,60 @@ Contacts: TypeAlias = tuple[Array, Array, Array]
 
 def robot_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float32) -> Array:
     """``(K, S)`` how many others a robot in ``state`` ``(K, n, S)`` is within ``extra`` of."""
-    dimension = arrays.goal.shape[1]
+    dimension, f = arrays.goal.shape[1], arrays.footprints
     distance = arrays.radius[:, None] + arrays.radius[None, :] + extra
     squared_distance = jnp.where(jnp.eye(len(arrays.radius), dtype=bool), -1, distance * distance)
 
     def count(state: Array, squared_distance: Array) -> Array:
-        position = state[:, :dimension]
-        near = ((position[:, None] - position[None, :]) ** 2).sum(axis=2) <= squared_distance[..., None]
-        if arrays.footprints is not None:
-            bodies = footprints.place_robots(arrays.footprints, state, dimension)
-            near &= _robots_within(arrays.footprints, bodies, arrays.footprints, bodies, extra, near.shape)
-        return near.sum(axis=1, dtype=jnp.int32)
+        bodies = None if f is None else footprints.place_robots(f, state, dimension)
+        robots = _Bodies(state[:, :dimension], f, bodies)
+        return _count_near(robots, robots, squared_distance, extra)
 
-    if arrays.footprints is not None or state.shape[-1] < LANES:
+    if f is not None or state.shape[-1] < LANES:
         return count(state, squared_distance)
     return on_gpu(partial(count_near, dimension), count, jax.lax.stop_gradient(state), squared_distance)
 
 
-def _robots_within(
-    f: FootprintArrays | None, bodies: PlacedBodies, g: FootprintArrays | None, others: PlacedBodies,
-    extra: Array | np.float32, shape: tuple[int, ...],
-) -> Array:  # fmt: skip
-    """``(K, O, S)`` whether one of a robot's bodies is within ``extra`` of one of another's."""
-    touch = footprints.of_robots(f, footprints.pairs_within(bodies, others, extra), shape[0])
-    return jnp.moveaxis(footprints.of_robots(g, jnp.moveaxis(touch, 1, 0), shape[1]), 0, 1)
-
-
 def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, extra: Array | np.float32) -> Array:
     """``(K, S)`` of how many other bodies a robot is within ``extra``."""
-    d = arrays.goal.shape[1]
-    position = state[:, :d]
-    gaps = (position[:, None] - others.positions[None, :, :, None]) ** 2
+    d, f, g = arrays.goal.shape[1], arrays.footprints, others.footprints
     distance = arrays.radius[:, None] + others.radius[None, :] + extra
-    near = gaps.sum(axis=2) <= (distance * distance)[..., None]
-    if arrays.footprints is not None or others.footprints is not None:
-        bodies = footprints.place_robots(arrays.footprints, state, d, arrays.radius)
-        its = footprints.place_bodies(others)
-        near &= _robots_within(arrays.footprints, bodies, others.footprints, its, extra, near.shape)
-    return near.sum(axis=1)
+    discs = f is None and g is None
+    robots = _Bodies(state[:, :d], f, None if discs else footprints.place_robots(f, state, d, arrays.radius))
+    moving = _Bodies(jnp.asarray(others.positions)[..., None], g, None if discs else footprints.place_bodies(others))
+    return _count_near(robots, moving, jnp.asarray(distance * distance), extra)
+
+
+class _Bodies(NamedTuple):
+    """``R`` robots, or what moves as they do."""
+
+    position: Array  #: ``(R, d, S)``
+    footprints: FootprintArrays | None  #: Which bodies are whose; ``None`` for one each
+    placed: PlacedBodies | None  #: Their bodies, or ``None`` where all are discs
+
+
+def _count_near(robots: _Bodies, others: _Bodies, squared_distance: Array, extra: Array | np.float32) -> Array:
+    """``(R, S)`` how many others a robot is within ``extra`` of, being nearer than the root of ``(R, O)``.
+
+    Others are taken one by one where there are many samples: all pairs at once would be gigabytes.
+    """
+    num_robots, _, num_samples = robots.position.shape
+
+    def compare(other: Array, count: Array) -> Array:
+        gaps = robots.position - others.position[other][None]
+        near = (gaps**2).sum(axis=1) <= squared_distance[:, other, None]
+        if robots.placed is not None and others.placed is not None:
+            rows = footprints.bodies_of(others.footprints, other, len(others.position))
+            its = PlacedBodies(*(jnp.take(part, rows, axis=part.ndim - 2) for part in others.placed))
+            touch = footprints.pairs_within(robots.placed, its, extra).any(axis=1)
+            near &= footprints.of_robots(robots.footprints, touch, num_robots)
+        return count + near.astype(jnp.int32)
+
+    nobody = jnp.zeros((num_robots, num_samples), jnp.int32)
+    if num_samples >= LANES:
+        return jax.lax.fori_loop(0, len(others.position), compare, nobody)
+    each = jax.vmap(partial(compare, count=nobody))(jnp.arange(len(others.position)))
+    return each.sum(axis=0, dtype=jnp.int32)
 
 
 def obstacle_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float32) -> Array:

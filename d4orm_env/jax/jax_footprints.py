@@ -83,6 +83,15 @@ def of_robots(f: FootprintArrays | None, touch: Array, count: int) -> Array:
     return robots.at[jnp.asarray(f.robot)].max(touch)
 
 
+def bodies_of(f: FootprintArrays | None, robot: Array, num_robots: int) -> Array:
+    """Numbers of a robot's bodies, the first of them again where others may have more."""
+    if f is None or len(f.robot) == num_robots:
+        return robot[None]
+    owner = jnp.asarray(f.robot)
+    rows = jnp.argsort(owner != robot, stable=True)[: 1 + MAX_TRAILERS]
+    return jnp.where(owner[rows] == robot, rows, robot)
+
+
 def place_bodies(bodies: MovingBodies) -> PlacedBodies:
     """Other bodies, the same in all samples."""
     position = jnp.asarray(bodies.positions).T[..., None]

@@ -36,6 +36,12 @@ from d4orm_planners.engine.sampling_types import (
 LOOK = 0.03  #: Seconds between looks at whether a run is to be stopped, if longer than a step; at most twice as many
 
 
+AT_ONCE = 2**24
+"""Discs whose rewards are computed at once, each of a robot, a sample and a step; of more, steps are taken in turn."""
+FOOTPRINT = 32
+"""Discs that a footprint counts as: its corners and edges are compared with those of others."""
+
+
 class _Static(NamedTuple):
     """Static inputs of a compiled denoising run, besides shapes."""
 
@@ -115,7 +121,17 @@ def _rewards(static: _Static, inputs: _Inputs, deformations: Array) -> Array:
     )
     after = roll_out(static.models, arrays, begin, inputs.base[..., None] + deformations)
     obstacles = None if inputs.moving is None else (inputs.moving.positions, inputs.moving.headings)
-    rewards: Array = jax.vmap(partial(_step_rewards, static, inputs))(after.state, obstacles)
+    bodies = num_robots if arrays.footprints is None else FOOTPRINT * len(arrays.footprints.robot)
+    horizon = len(after.state)
+    steps = max(
+        n for n in range(1, horizon + 1) if horizon % n == 0 and (n == 1 or n * bodies * num_samples <= AT_ONCE)
+    )
+    reward = partial(_step_rewards, static, inputs)
+    rewards: Array
+    if steps < horizon:
+        rewards = jax.lax.map(lambda step: reward(*step), (after.state, obstacles), batch_size=steps)
+    else:
+        rewards = jax.vmap(reward)(after.state, obstacles)
     return _sum(rewards) / jnp.float32(len(rewards))
 
 

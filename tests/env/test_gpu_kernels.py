@@ -106,5 +106,6 @@ def test_a_denoising_run_is_one_loop_of_few_kernels_on_a_gpu(model: str, monkeyp
     (program,) = lowered
     # Rollouts and, of teams of discs, pair checks.
     assert program.count("gpu.triton") == (1 if problem.team.shapes else 2)
-    assert program.count("stablehlo.while") == 1
+    # Of footprints, which JAX itself compares, others are taken in turn.
+    assert program.count("stablehlo.while") == (2 if problem.team.shapes else 1)
     assert "callback" not in program

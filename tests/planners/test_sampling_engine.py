@@ -16,6 +16,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import MODELS
+from d4orm_env.footprints import Box
 from d4orm_env.scenarios import list_scenarios, make_problem
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 from d4orm_planners.engine.jax_sampling import JaxSamplingEngine
@@ -531,3 +532,15 @@ def test_kernels_of_different_models_share_no_file() -> None:
     assert score_kernel(("holonomic2d",) * 5) is score_kernel(("holonomic2d",))
     # Teams with another model compile no more than the models that they have.
     assert score_kernel(("car", "holonomic2d")).py_func.__qualname__.endswith("_holonomic2d_car")
+
+
+@slow
+@pytest.mark.parametrize("robots", [{}, {"model": "differential_drive", "footprint": Box(0.36, 0.24)}])
+def test_denoising_of_64_robots_in_jax_needs_less_than_2_gb(robots: dict[str, Any]) -> None:
+    problem = make_problem("circle", num_robots=64, diameter=16.0, horizon=100, **robots)
+    none = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+    compiled, _ = JAX._lower(
+        SamplingTask(problem, none), SOFTMAX, none, np.linspace(1, 0.1, 3, dtype=np.float32), 1024, 0
+    )
+    memory = compiled.memory_analysis()
+    assert memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes < 2e9

@@ -72,17 +72,23 @@ def plan_on(processor: Processor) -> dict[str, str]:
     return json.loads(output.stdout)
 
 
+def here() -> list[Processor]:
+    """Those that this machine can be, the oldest first; of others it is said that they are left out."""
+    features, found = binding.get_host_cpu_features(), []
+    for processor in PROCESSORS.get(platform.machine(), ()):
+        if features.get(processor.needs, processor.needs in ("neon", "sse2")):
+            found.append(processor)
+        else:
+            print(f"{processor.cpu}: this machine has no {processor.needs}, left out")
+    return found
+
+
 def main() -> int:
     """Compare them all, and return how many differ."""
     expected = json.loads((HERE / "digests.json").read_text())
     if platform.machine() not in PROCESSORS:
         print(f"no processors to emulate on {platform.machine()}; nothing compared")
-    features, failures, emulated = binding.get_host_cpu_features(), 0, []
-    for processor in PROCESSORS.get(platform.machine(), ()):
-        if features.get(processor.needs, processor.needs in ("neon", "sse2")):
-            emulated.append(processor)
-        else:
-            print(f"{processor.cpu}: this machine has no {processor.needs}, left out")
+    failures, emulated = 0, here()
     # They compile for most of the time, each on one core.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for processor, found in zip(emulated, pool.map(plan_on, emulated)):

@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -50,10 +50,10 @@ def medians(reports: list[dict[str, Any]]) -> dict[str, float]:
     return {key: median(seconds) for key, seconds in rows.items()}
 
 
-def bench(tree: Path, folder: Path, arguments: list[str]) -> dict[str, Any]:
-    """The report of a tree's benchmark."""
+def bench(tree: Path, folder: Path, arguments: list[str], variables: Mapping[str, str] = os.environ) -> dict[str, Any]:
+    """The report of a tree's benchmark, run with these variables."""
     command = [sys.executable, "-c", RUN, "bench", *arguments, "--quiet", "--out", str(folder)]
-    subprocess.run(command, cwd=tree, env=os.environ | {"PYTHONPATH": str(tree)}, check=True)
+    subprocess.run(command, cwd=tree, env={**variables, "PYTHONPATH": str(tree)}, check=True)
     report: dict[str, Any] = json.loads((folder / "bench.json").read_text())
     return report
 
