@@ -74,23 +74,27 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
     # Once all have docked nothing moves, mostly long before the horizon: a step of that is enough.
     busy = int(np.flatnonzero(array.any(axis=(1, 2))).max(initial=0)) + 2
     docks_alone = problem.arrival != "stay" and set(problem.team.models) <= set(MODELS)
-    report = _judge(problem, array[:busy]) if docks_alone and busy < len(array) else None
-    if report is None or not np.isfinite(report.arrival_times).all():
-        report = _judge(problem, array)
-    return report
+    if docks_alone and busy < len(array):
+        return _judge(problem, array[:busy], array)
+    return _judge(problem, array)
 
 
-def _judge(problem: Problem, array: Floats) -> VerificationReport:
+def _judge(problem: Problem, array: Floats, instead: Floats | None = None) -> VerificationReport:
+    """Judge controls or, should not all robots dock, those ``instead``."""
     motion = TeamMotion(problem, array)
     sub_steps = np.ceil(problem.dt * np.sqrt(motion.bend / (8 * CHORD_ERROR * problem.team.girth.astype(np.float64))))
     if sub_steps.max() > MAX_SUB_STEPS:
         return _left_out(problem, list(_too_violent(sub_steps, motion, problem)))
     course = _Course(motion, max(MIN_SUB_STEPS, int(sub_steps.max())), problem)
-    return _report(problem, array, motion, course)
-
-
-def _report(problem: Problem, controls: Floats, motion: TeamMotion, course: _Course) -> VerificationReport:
     docking = find_docking(problem, motion, course.ends)
+    if instead is not None and not np.isfinite(docking.arrival_times).all():
+        return _judge(problem, instead)
+    return _report(problem, array, motion, course, docking)
+
+
+def _report(
+    problem: Problem, controls: Floats, motion: TeamMotion, course: _Course, docking: Docking
+) -> VerificationReport:
     robot, body = course.bodies(docking)
     shapes = course.shapes.take(body) if course.shapes is not None else None
     radius = problem.team.radius.astype(np.float64)[robot]
@@ -178,7 +182,8 @@ class _Course:
         for steps in self._parts(horizon, max(self._numbers, num_pairs // BLOCKS[0])):
             displacement, position = self._motion.displacement(steps, self._sub_steps), self.ends[:-1][steps]
             if len(robot) > displacement.shape[2]:  # copying is not free, and one reading each is the rule
-                displacement, position = displacement[:, :, robot], position[:, robot]
+                # By take(), because an index leaves the robots outermost in memory.
+                displacement, position = displacement.take(robot, axis=2), position.take(robot, axis=1)
             absorbed = np.arange(horizon)[steps, None] >= docking.steps
             displacement[np.broadcast_to(absorbed[:, None], displacement.shape[:3])] = 0.0
             position = np.where(absorbed[..., None], rest, position)
