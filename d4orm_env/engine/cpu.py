@@ -6,7 +6,7 @@ each has its own goals, state and clock. A single environment is a batch of one.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +29,8 @@ from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.tiles import STRIDE, allocate_boxes, pose_rows
 from d4orm_env.engine.types import ObservationInputs, StepResult, WorldBatch, checked_controls
 from d4orm_env.engine.world_tiles import WorldArrays
+
+SHARED = 2**15  #: Steps of all robots together from which on threads share the checks of a rollout
 
 
 class WorldKernels(NamedTuple):
@@ -113,7 +115,8 @@ class CpuEngine:
     def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
         """See :meth:`d4orm_env.engine.types.Engine.rollout`."""
         away = np.zeros(problem.num_robots, bool)
-        moments = _rolled_out(problem.arrays, problem.start, away, checked_controls(problem, controls))
+        arrays, given = problem.arrays, checked_controls(problem, controls)
+        moments = _rolled_out(arrays, problem.start, away, given, threads=self._threads)
         return Trajectory(
             states=moments.state,
             positions=np.ascontiguousarray(moments.state[..., : problem.dimension]),
@@ -146,11 +149,18 @@ def _view(layout: ObservationLayout) -> ObservationSpec:
 
 
 def _rolled_out(
-    arrays: ProblemArrays, states: FloatArray, before: BoolArray, controls: FloatArray, *, checked: bool = True
+    arrays: ProblemArrays,
+    states: FloatArray,
+    before: BoolArray,
+    controls: FloatArray,
+    *,
+    checked: bool = True,
+    threads: Threads | None = None,
 ) -> WorldArrays:
     """The ``H+1`` moments of a team from states ``(K, n)`` on under controls ``(H, K, m)``, clipped here.
 
-    Unless they are ``checked``, contacts are not looked for, and there are no rewards.
+    Unless they are ``checked``, contacts are not looked for, and there are no rewards. ``threads`` share that where
+    there is much to check.
     """
     arrays, rows = typed(arrays), len(controls) + 1
     state = np.empty((rows, *states.shape), np.float32)
@@ -161,9 +171,17 @@ def _rolled_out(
     goal, inverse = arrays.goal[None], arrays.inverse_initial_distance[None]
     nothing = np.empty((0, 0, 2 * goal.shape[-1] + 1), np.float32)
     moments = WorldArrays(goal, inverse, state, control, arrived, nothing, collided, violated, rewards)
-    w = aligned_zeros(len(states) * STRIDE + pose_rows(arrays.footprints) * TILE)
-    near = np.empty((len(states), 3), np.uint64)
-    kernels_of_codes(arrays.model_codes.tobytes()).roll_out(arrays, moments, w, near, allocate_boxes(arrays))
+    kernel, num_tiles = kernels_of_codes(arrays.model_codes.tobytes()).roll_out, -(-len(rewards) // TILE)
+
+    def run(moves: bool, tiles: IntArray) -> None:
+        w = aligned_zeros(len(states) * STRIDE + pose_rows(arrays.footprints) * TILE)
+        kernel(arrays, moments, moves, tiles, w, np.empty((len(states), 3), np.uint64), allocate_boxes(arrays))
+
+    if threads is None or rewards.size < SHARED:
+        run(True, np.array((0, num_tiles)))
+    else:
+        run(True, np.zeros(2, np.int64))
+        threads.over(num_tiles, partial(run, False))
     return moments
 
 

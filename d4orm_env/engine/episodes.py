@@ -178,7 +178,9 @@ def advance_worlds_kernel(
     return advance_worlds
 
 
-RollOut: TypeAlias = Kernel[[ProblemArrays, WorldArrays, FloatArray, NDArray[np.uint64], TeamBoxes], None]
+RollOut: TypeAlias = Kernel[
+    [ProblemArrays, WorldArrays, bool, IntArray, FloatArray, NDArray[np.uint64], TeamBoxes], None
+]
 """A kernel of :func:`roll_out_kernel`."""
 
 
@@ -215,21 +217,23 @@ def roll_out_kernel(names: tuple[str, ...]) -> RollOut:
     """A kernel that steps one world through the rows of ``moments.control``, keeping every moment.
 
     ``moments`` is a :class:`WorldArrays` of ``H+1`` rows and the goals of all, of which the first is the start and has
-    no control. The motion comes first; then 64 moments at a time are checked, as if they were worlds, as far as there
-    are rewards. ``w`` is zero, ``(K STRIDE + P TILE,)`` with ``P`` rows of poses, and ``near`` ``(K, 3)``: see
-    :mod:`~d4orm_env.engine.tiles`; ``boxes`` are of :func:`~d4orm_env.engine.tiles.allocate_boxes`.
+    no control. The motion comes first, if it ``moves``; then 64 moments at a time are checked, as if they were worlds:
+    ``tiles`` ``(2,)`` are the first 64 and those after the last. ``w`` is zero, ``(K STRIDE + P TILE,)`` with ``P``
+    rows of poses, and ``near`` ``(K, 3)``: see :mod:`~d4orm_env.engine.tiles`; ``boxes`` are of
+    :func:`~d4orm_env.engine.tiles.allocate_boxes`.
     """
     move_robot = dispatch({name: _stepper(MODELS[name]) for name in names})
 
     @cached_kernel(variant="_".join(names), key=models_key(names), **WITHOUT_ARRAYS)
     def roll_out(
-        arrays: ProblemArrays, moments: WorldArrays, w: FloatArray, near: NDArray[np.uint64], boxes: TeamBoxes
-    ) -> None:
+        arrays: ProblemArrays, moments: WorldArrays, moves: bool, tiles: IntArray, w: FloatArray,
+        near: NDArray[np.uint64], boxes: TeamBoxes,
+    ) -> None:  # fmt: skip
         use_wide_registers()
         arrays, moments = borrow(arrays), borrow(moments)
         num_robots, dimension = arrays.goal.shape
         state, arrived = moments.state, moments.arrived
-        for t in range(1, state.shape[0]):
+        for t in range(1, state.shape[0] if moves else 1):
             # Loops, because numba takes seconds to compile assignments of slices.
             idle = arrays.docks
             for k in range(num_robots):
@@ -243,9 +247,9 @@ def roll_out_kernel(names: tuple[str, ...]) -> RollOut:
                 continue
             for k in range(num_robots):
                 move_robot(arrays.model_codes[k], arrays, moments, t, k)
-        for first in range(0, moments.rewards.shape[0], TILE):
-            load(moments, first, w)
+        for tile in range(tiles[0], tiles[1]):
+            load(moments, tile * TILE, w)
             measure_goal_distance(num_robots, dimension, w)
-            check_contacts(arrays, moments, first, w, boxes, near)
+            check_contacts(arrays, moments, tile * TILE, w, boxes, near)
 
     return roll_out

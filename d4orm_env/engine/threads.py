@@ -59,6 +59,7 @@ def _queue(num_threads: int, process: int) -> SimpleQueue[Task]:
 
 
 def _work(todo: SimpleQueue[Task]) -> None:
+    keep_to_one_core()  # who handed work on and waited for it here might wait for ever
     while True:
         work, part, done = todo.get()
         error = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from dataclasses import fields
 from typing import Any
 
 import numba
@@ -18,7 +19,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.transition import TimeStep, advance
-from d4orm_env.engine import elementary
+from d4orm_env.engine import cpu, elementary
 from d4orm_env.engine.choice import ENGINES, get_engine
 from d4orm_env.engine.cpu import CpuEngine
 from d4orm_env.engine.threads import Threads, available_cores
@@ -258,6 +259,21 @@ def test_float32_stays_close_to_float64_over_a_whole_horizon(model: str) -> None
         np.testing.assert_allclose(engine.rollout(problem, controls).states[-1, 0], x, atol=2e-5)
 
 
+@pytest.mark.parametrize("name", ["circle", "four_obstacles"])
+def test_threads_that_share_a_rollout_find_the_same(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    problem = make_problem(name, num_robots=6, horizon=150)
+    controls = toward_goals(problem)
+    alone = CPU.rollout(problem, controls)
+    assert alone.collided.any()
+    shared, over = list[int](), Threads.over
+    monkeypatch.setattr(cpu, "SHARED", 0)
+    monkeypatch.setattr(Threads, "over", lambda self, count, work: shared.append(count) or over(self, count, work))
+    together = CpuEngine(3).rollout(problem, controls)
+    assert shared == [3]
+    for field in fields(Trajectory):
+        np.testing.assert_array_equal(getattr(together, field.name), getattr(alone, field.name))
+
+
 class TestThreads:
     @pytest.mark.parametrize("num_threads", [1, 2, 3, 7])
     @pytest.mark.parametrize("count", [0, 1, 2, 3, 5, 16, 33])
@@ -287,6 +303,17 @@ class TestThreads:
 
         with pytest.raises(RuntimeError, match="a part failed"):
             Threads(3).over(3, work)
+
+    def test_parts_that_share_their_work_do_not_wait_for_each_other(self) -> None:
+        seen: list[int] = []
+
+        def work(part: Any) -> None:
+            Threads(3).over(3, lambda inner: seen.extend(range(*inner)))
+
+        caller = threading.Thread(target=Threads(3).over, args=(3, work), daemon=True)
+        caller.start()
+        caller.join(30)
+        assert sorted(seen) == [0, 0, 0, 1, 1, 1, 2, 2, 2]
 
     def test_the_number_comes_from_the_environment(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("D4ORM_NUM_THREADS", "3")
