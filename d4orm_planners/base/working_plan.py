@@ -66,14 +66,20 @@ class WorkingPlan:
     def move(self, robots: ArrayLike, controls: FloatArray, states: FloatArray, arrived: ArrayLike) -> None:
         """Give robots ``(R,)`` other controls ``(H, R, m)``, states ``(H+1, R, n)`` and arrivals ``(R,)``."""
         index = np.asarray(robots)
+        self._note(index, controls, states, arrived)
+        self._place(index, states[..., : self.problem.dimension])
+
+    def _note(self, index: IntArray, controls: FloatArray, states: FloatArray, arrived: ArrayLike) -> None:
         for rows, others in ((self.controls, controls), (self.states, states)):
             rows[:, index, : others.shape[2]] = others
             rows[:, index, others.shape[2] :] = 0
         self.arrived[index] = arrived
         self.reported[index] = self.problem.horizon + 1
-        self.index.move(index, states[..., : self.problem.dimension])
+
+    def _place(self, index: ArrayLike, positions: FloatArray) -> None:
+        self.index.move(index, positions)
         if self._checked is not self.index:
-            self._checked.move(index, states[:: self._interval, :, : self.problem.dimension])
+            self._checked.move(index, positions[:: self._interval])
 
     def faults(self, robots: ArrayLike) -> tuple[Floats, IntArray]:
         """``(R,)`` present faults of robots ``(R,)`` at the steps that are checked, and ``(R,)`` the step of the first.
@@ -93,44 +99,62 @@ class WorkingPlan:
         It has the fewest faults and, of those with as many, takes the least time. With ``or_longer`` it may take longer
         than what the robot does, as long as it has no more faults.
         """
-        for i, robot in enumerate(np.asarray(robots).tolist()):
-            costs = self._path_costs(robot, np.moveaxis(paths.positions[:, i], 1, 0), paths.arrived[i])
+        numbers, moved = np.asarray(robots), list[tuple[int, int]]()
+        present = self.positions[:, numbers].swapaxes(0, 1)[:, None]
+        tried = np.concatenate([present, np.moveaxis(paths.positions, 0, 2)], axis=1)
+        arrives = np.concatenate([self.arrived[numbers, None], paths.arrived], axis=1)
+        moves = (tried != tried[:, :1]).any(axis=(2, 3))  # otherwise than at present
+        different = moves | (arrives != arrives[:, :1])
+        own_faults, share, _ = self._alone(numbers, tried, arrives)
+        for i, robot in enumerate(numbers.tolist()):
+            costs = self._path_faults(robot, tried[i], different[i], own_faults[i]) + share[i]
             if self.reported[robot] <= self.problem.horizon:
                 costs[0] += 1
                 costs[1:] += (paths.states[:, i] == self.states[:, robot, None, : paths.states.shape[3]]).all(
                     axis=(0, 2)
                 )
-            present, best = costs[0], int(costs[1:].argmin())
-            if costs[1 + best] < (np.floor(present) + 1 if or_longer else present):
-                self.move([robot], paths.controls[:, [i], best], paths.states[:, [i], best], paths.arrived[[i], best])
+            best = int(costs[1:].argmin())
+            if costs[1 + best] < (np.floor(costs[0]) + 1 if or_longer else costs[0]):
+                moved.append((i, best))
+                if moves[i, 1 + best]:
+                    self._place([robot], paths.positions[:, [i], best])
+        # All at once: a robot's own steps are far apart in memory.
+        rows, chosen = np.array(moved, np.int64).reshape(-1, 2).T
+        controls, states = paths.controls[:, rows, chosen], paths.states[:, rows, chosen]
+        self._note(numbers[rows], controls, states, paths.arrived[rows, chosen])
 
-    def _path_costs(self, robot: int, paths: FloatArray, arrived: BoolArray) -> Floats:
-        """``(1 + V,)`` costs of a robot's present path and of others ``(V, H+1, d)``; all zero if they are the same."""
-        positions = np.concatenate([self.positions[None, :, robot], paths])
-        arrives = np.append(self.arrived[robot], arrived)
-        # Most paths turn to the goal where the robot heads for it anyhow. Equal ones are checked once.
-        seen = dict[tuple[bytes, bool], int]()
-        which = [seen.setdefault((path.tobytes(), bool(arrives[v])), len(seen)) for v, path in enumerate(positions)]
-        if len(seen) == 1:
-            return np.zeros(len(positions))
-        different = [which.index(number) for number in range(len(seen))]
-        costs: Floats = self._costs([robot], positions[None, different], arrives[None, different])[0][0, which]
-        return costs
+    def _path_faults(self, robot: int, paths: FloatArray, different: BoolArray, alone: IntArray) -> IntArray:
+        """``(1 + V,)`` faults of a robot's paths ``(1 + V, H+1, d)``, with those of each ``alone``, of which some are
+        ``different`` from the first, its present one; all zero if none is.
+        """
+        if not different.any():
+            return np.zeros(len(paths), np.int64)
+        counted = np.append(0, np.flatnonzero(different))
+        met, _ = self._checked.count_meetings([robot], paths[None, counted, :: self._interval])
+        faults = np.full(len(paths), met[0, 0])
+        faults[counted] = met[0]
+        return faults + alone
 
     def _costs(self, robots: ArrayLike, paths: FloatArray, arrived: BoolArray) -> tuple[Floats, IntArray]:
         """``(R, V)`` faults of paths ``(R, V, H+1, d)``, plus the share of the horizon that they take, less than one;
         and the step of the first fault.
         """
+        alone, share, first = self._alone(robots, paths, arrived)
+        met, meeting = self._checked.count_meetings(robots, paths[:, :, :: self._interval])
+        if self._interval > 1:
+            # What there is none of comes after the last step.
+            meeting = np.minimum(meeting * self._interval, self.problem.horizon + 1)
+        return met + alone + share, np.minimum(meeting, first)
+
+    def _alone(self, robots: ArrayLike, paths: FloatArray, arrived: BoolArray) -> tuple[IntArray, Floats, IntArray]:
+        """The same without robots met: faults, the share of the horizon, and the step of the first fault."""
         paths, horizon = np.ascontiguousarray(paths), self.problem.horizon
-        checked = paths[:, :, :: self._interval]
-        met, meeting = self._checked.count_meetings(robots, checked)
         touching, moves, unsure = path_index.check_alone(self.problem.arrays, robots, paths)
         if self._interval > 1:
+            checked = paths[:, :, :: self._interval]
             touching = path_index.check_alone(self.problem.arrays, robots, checked)[0] * self._interval
-            # What there is none of comes after the last step.
-            meeting = np.minimum(meeting * self._interval, horizon + 1)
-        faults = met + (unsure <= horizon) + MISSED_GOAL * (~arrived | (touching <= horizon))
-        return faults + moves / (horizon + 1), np.minimum(np.minimum(meeting, touching), unsure)
+        faults = (unsure <= horizon) + MISSED_GOAL * (~arrived | (touching <= horizon))
+        return faults, moves / (horizon + 1), np.minimum(touching, unsure)
 
 
 TURNS = (0, 8, 16, 32, 64)  #: Steps before a robot's arrival, or nearest approach, to turn straight to its goal at

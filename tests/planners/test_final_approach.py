@@ -157,7 +157,7 @@ def test_who_is_refused_is_at_fault_until_it_moves() -> None:
     assert faults.tolist() == [1, 1]
     assert first.tolist() == [2, 2]  # they meet within the second step
     path = drives(problem, *at_rest(problem), [[0], [0]], np.full((2, 1, 1, 2), [[0.0, 1.0]]))
-    team.take_best([0], path)
+    team.take_best([0], Rollouts(path.controls[:, :1], path.states[:, :1], path.arrived[:1], 2))
     assert team.faults([0, 1])[0].tolist() == [0, 1]
     # What it does already is no other way.
     before = team.controls.copy()

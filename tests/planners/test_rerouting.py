@@ -60,11 +60,13 @@ def test_a_path_costs_what_it_costs_whichever_paths_it_is_compared_with() -> Non
     """What a robot does at present, the same again, standing still, another robot's path, and that again."""
     team = rerouted(make_problem("random", num_robots=10, seed=1))
     own, other = (team.positions[:, robot] for robot in (3, 4))
-    paths, arrived = np.stack([own, np.repeat(own[:1], len(own), axis=0), other, other]), np.array([1, 0, 1, 1], bool)
+    still, arrived = np.repeat(own[:1], len(own), axis=0), np.array([1, 1, 0, 1, 1], bool)
+    paths, different = np.stack([own, own, still, other, other]), np.array([0, 0, 1, 1, 1], bool)
     alone = [team._costs([3], path[None, None], arrived[None, [i]])[0][0, 0] for i, path in enumerate(paths)]
-    assert team._path_costs(3, paths, arrived).tolist() == [alone[0], *alone]
+    own_faults, share, _ = team._alone([3], paths[None], arrived[None])
+    assert (team._path_faults(3, paths, different, own_faults[0]) + share[0]).tolist() == alone
     assert len(set(alone)) == 3
-    assert team._path_costs(3, paths[:1], arrived[:1]).tolist() == [0.0, 0.0]
+    assert team._path_faults(3, paths[:2], different[:2], own_faults[0, :2]).tolist() == [0, 0]
 
 
 def test_who_cannot_pass_waits() -> None:
