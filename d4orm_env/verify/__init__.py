@@ -185,7 +185,7 @@ class _Course:
                 # By take(), because an index leaves the robots outermost in memory.
                 displacement, position = displacement.take(robot, axis=2), position.take(robot, axis=1)
             absorbed = np.arange(horizon)[steps, None] >= docking.steps
-            displacement[np.broadcast_to(absorbed[:, None], displacement.shape[:3])] = 0.0
+            np.copyto(displacement, 0.0, where=absorbed[:, None, :, None])
             position = np.where(absorbed[..., None], rest, position)
             path, travel, turn = position[:, None] + displacement, norm(displacement).max(axis=1), np.zeros((0, 0, 0))
             if self.shapes is not None:

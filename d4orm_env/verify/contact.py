@@ -62,8 +62,7 @@ class Watch(ABC):
         self.kind, self.names, self.rows, self.columns = kind, names, rows, columns
         self.minimum = np.inf
         self._robot = robot
-        size = (int(robot.max()) + 1) * len(names)
-        self._smallest, self._smallest_time, self._first = (np.full(size, np.inf) for _ in range(3))
+        self._smallest, self._smallest_time, self._first = np.empty((3, 0))  # with room once anything touches
 
     @abstractmethod
     def gap(self, stretch: Stretch, steps: Indices, pairs: Indices, lead: Floats) -> Floats:
@@ -135,6 +134,10 @@ class Watch(ABC):
         hit = np.flatnonzero(touching.any(axis=1))
         if len(hit) == 0:
             return
+        if len(self._first) == 0:
+            self._smallest, self._smallest_time, self._first = np.full(
+                (3, (int(self._robot.max()) + 1) * len(self.names)), np.inf
+            )
         gap, fraction, steps, pairs = gap[hit], fraction[hit], steps[hit], pairs[hit]
         each, first, lowest = np.arange(len(hit)), touching[hit].argmax(axis=1), gap.argmin(axis=1)
         key = self._robot[self.rows[pairs]] * len(self.names) + self.thing(self.columns[pairs])
@@ -175,14 +178,15 @@ class Pairs(Watch):
         lower, upper = lower - widening, upper + widening
         # Boxes that overlap along one axis: each with those that begin before it ends.
         order = np.argsort(lower[:, axis], kind="stable")
-        ranks = np.arange(len(order))
-        count = np.searchsorted(lower[order, axis], upper[order, axis], side="right") - ranks - 1
-        first = np.repeat(ranks, count)
-        second = first + 1 + np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        a, b = order[first], order[second]
-        near = np.all((lower[a] <= upper[b]) & (lower[b] <= upper[a]), axis=1)
-        near &= self._robot[a] != self._robot[b]  # two readings of one robot do not meet
-        key = np.sort(np.minimum(a, b)[near] * len(order) + np.maximum(a, b)[near])
+        lower, upper, ranks = lower[order].T, upper[order].T, np.arange(len(order))
+        count = np.searchsorted(lower[axis], upper[axis], side="right") - ranks - 1
+        second = np.arange(count.sum()) + np.repeat(ranks + 1 - (np.cumsum(count) - count), count)
+        near = np.ones(len(second), bool)
+        for low, high in zip(np.delete(lower, axis, axis=0), np.delete(upper, axis, axis=0), strict=True):
+            near &= (np.repeat(low, count) <= high[second]) & (low[second] <= np.repeat(high, count))
+        a, b = order[np.repeat(ranks, count)[near]], order[second[near]]
+        apart = self._robot[a] != self._robot[b]  # two readings of one robot do not meet
+        key = np.sort((np.minimum(a, b) * len(order) + np.maximum(a, b))[apart])
         self.rows, self.columns = np.divmod(key, len(order))
         self._size = self._radius[self.rows] + self._radius[self.columns]
 
