@@ -88,6 +88,7 @@ def _judge(problem: Problem, array: Floats, instead: Floats | None = None) -> Ve
     course = _Course(motion, max(MIN_SUB_STEPS, int(sub_steps.max())), problem)
     docking = find_docking(problem, motion, course.ends)
     if instead is not None and not np.isfinite(docking.arrival_times).all():
+        del motion, sub_steps, course, docking  # both would not fit into as much memory
         return _judge(problem, instead)
     return _report(problem, array, motion, course, docking)
 

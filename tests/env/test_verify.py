@@ -153,13 +153,15 @@ def test_a_docked_robot_stands_where_it_docked():
 def test_only_the_time_until_all_have_docked_is_judged(monkeypatch):
     """Nobody waits for the horizon, but for who coasts to the goal: the second robot drifts there after its push."""
     problem = make(["holonomic2d"] * 2, [(0, 0), (0, 5)], [(0.1, 0), (1.5, 5)], goal_radius=0.1, dt=0.1, horizon=400)
-    controls, judged = np.zeros((400, 2, 2)), []
+    controls, judged, watched = np.zeros((400, 2, 2)), [], []
     controls[:2, :, 0] = 1.0
-    motion = verify_module.TeamMotion
+    motion, watch = verify_module.TeamMotion, verify_module.make_watches
     monkeypatch.setattr(verify_module, "TeamMotion", lambda *args: judged.append(len(args[1])) or motion(*args))
+    monkeypatch.setattr(verify_module, "make_watches", lambda *args: watched.append(args[1]) or watch(*args))
     both = verify(problem, controls)
     assert both.ok
     assert judged == [3, 400]
+    assert len(watched) == 1  # who has docked decides, before contacts are looked for
     first = problem.select([0])
     alone = verify(first, controls[:, :1])
     assert judged[2:] == [3]
