@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import gymnasium
@@ -14,20 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, as_float32, short_repr, truth
+from d4orm_env.core.problem import Problem
 from d4orm_env.envs.features import Features
 from d4orm_env.envs.joint_state import split_state
 from d4orm_planners.base.measured_states import acting_robots, stacked_observations
+from d4orm_planners.base.planner_registry import PolicyLike, called, copy_policy, make_policy, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, Policy, within_limits
 from d4orm_planners.tracking.goal_drives import brake_to_dock
-
-if TYPE_CHECKING:
-    from pettingzoo import ParallelEnv
-
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
-from d4orm_env.core.problem import Problem
-from d4orm_planners.base.planner_registry import PolicyLike, called, copy_policy, make_policy, policy_settings
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
