@@ -18,7 +18,8 @@ from d4orm_planners.evaluation.sqlite_file import SqliteFile
 STORE = "trials.sqlite"  #: Name of the file in a folder of results
 
 
-class TrialKey(NamedTuple):
+@dataclass(frozen=True)
+class TrialKey:
     """Key of a trial."""
 
     policy: str  #: Registry name
@@ -43,19 +44,9 @@ class BestSoFar(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
-    """One episode of one policy and how it ended: a row of the store, with a column per field, in this order.
+class Trial(TrialKey):
+    """One episode of one policy and how it ended: a row of the store, a column per field, its key first."""
 
-    The first seven fields are its :class:`TrialKey`.
-    """
-
-    policy: str
-    config: str
-    problem: str
-    control_noise_std: float
-    seed: int
-    disturbances: str = "[]"
-    physics: str = "model"
     label: str  #: Name of the policy with these settings
     scenario: str  #: Name of the scenario, with the arguments that it was given
     num_robots: int  #: Team size
@@ -97,7 +88,7 @@ class Trial:
 
     @property
     def key(self) -> TrialKey:
-        return TrialKey(*(getattr(self, name) for name in TrialKey._fields))
+        return TrialKey(*(getattr(self, name) for name in _KEYS))
 
     @cached_property
     def progress(self) -> list[BestSoFar]:
@@ -123,7 +114,8 @@ class Trial:
 
 
 _NAMES = tuple(field.name for field in fields(Trial))
-_KEY = ", ".join(TrialKey._fields)
+_KEYS = tuple(field.name for field in fields(TrialKey))
+_KEY = ", ".join(_KEYS)
 _TRUTHS = ("success", "verified")
 _MACHINE = {"processor", "cores", "cores_used", "python"}  #: Least keys of a machine's description
 
@@ -157,7 +149,7 @@ _TABLE = f"({', '.join(_COLUMNS.values())}, PRIMARY KEY ({_KEY})) WITHOUT ROWID"
 _ADD = (
     f"INSERT INTO trials ({', '.join(_NAMES)}) VALUES ({', '.join('?' * len(_NAMES))}) ON CONFLICT ({_KEY}) "
     + "DO UPDATE SET "
-    + ", ".join(f"{name} = excluded.{name}" for name in _NAMES if name not in TrialKey._fields)
+    + ", ".join(f"{name} = excluded.{name}" for name in _NAMES if name not in _KEYS)
     + " WHERE trials.error != ''"
 )
 

@@ -111,7 +111,7 @@ class Job:
     def failed(self, condition: Condition, error: str) -> Trial:
         """The trial under one condition, which has no outcome."""
         return Trial(
-            **self.key(condition)._asdict(),
+            **vars(self.key(condition)),
             label=self.policy.label,
             scenario=self.scenario,
             num_robots=self.problem.num_robots,

@@ -131,7 +131,7 @@ def test_the_same_trial_in_another_physics_is_another_one(tmp_path: Path) -> Non
         evaluate("go-to-goal", problem, seeds=[4], workers=1, out=tmp_path, physics=physics)
     ours, theirs = TrialStore.existing(tmp_path).trials()
     assert (ours.physics, theirs.physics) == ("model", "mujoco")
-    assert ours.key == theirs.key._replace(physics="model")
+    assert ours.key == replace(theirs.key, physics="model")
     assert ours.verified
     assert theirs.verified is None
     episode = run_episode(mujoco.parallel_env(problem=problem), "go-to-goal", seed=4)

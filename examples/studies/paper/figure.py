@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
@@ -177,4 +177,4 @@ def grouped(figure: Figure, trials: Sequence[Trial]) -> list[Group]:
 
 def _cell(label: str, key: TrialKey) -> tuple[object, ...]:
     """Return what tells a trial from all others of a figure."""
-    return label, json.loads(key.config).get("nodes"), *key[2:]
+    return label, json.loads(key.config).get("nodes"), *astuple(key)[2:]
