@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,9 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import count
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.render.replay import Replay
+from d4orm_planners.base.planner_registry import make_policy
 from d4orm_planners.play.edits import MOST_WAITING, CommandQueue, Edit, followed, queued
-from d4orm_planners.play.viewport import Drivers, EpisodeOptions, Frame, Status, Viewport
+from d4orm_planners.play.viewport import EpisodeOptions, Frame, Status, Viewport
 
 _IDLE = 0.1
 _MOST_EDITING = 0.25  #: Seconds after a step from which no other change is begun; the clock goes first
@@ -40,7 +42,7 @@ class Session:
     ) -> None:
         self._loaded, self.policies = problem, policies or ("d4orm-c2f",)
         self._options, self.levels = EpisodeOptions(seed, lifelong, observation), dict[str, float]()
-        self._drivers = Drivers()
+        self._driver = cache(make_policy)  # some hold threads, so there is one of each
         self.commands = CommandQueue()  #: What was asked for by methods that wait for the next step
         self._paused, self._steps_wanted, self._speed = False, 0, 1.0
         self._status = Status(0, 0, 0.0, 0.0, problem.dt, "planning", "", 0)
@@ -142,12 +144,7 @@ class Session:
     @queued("horizon")
     def set_horizon(self, steps: int) -> None:
         """Set the steps that a policy which predicts looks ahead; others have no such setting."""
-        former, self._drivers.horizon = self._drivers.horizon, steps
-        try:
-            self._begin()
-        except Exception:
-            self._drivers.horizon = former
-            raise
+        self._begin(options=replace(self._options, horizon=steps))
 
     @queued("lifelong")
     def set_lifelong(self, lifelong: bool) -> None:
@@ -249,7 +246,7 @@ class Session:
             self._show("planning")
         try:
             viewports = tuple(
-                Viewport(name, self._drivers.policy(name), scene, options, recording)
+                Viewport(name, self._driver(name, **options.settings(name)), scene, options, recording)
                 for name, scene, recording in zip(names, scenes, recordings, strict=True)
             )
         except Exception:

@@ -10,7 +10,6 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from d4orm_env.disturbances.robot_faults import pushed
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.render.replay import ReplayMotion, motion
 from d4orm_planners.base.episode import open_env
-from d4orm_planners.base.planner_registry import make_policy, setting_names
+from d4orm_planners.base.planner_registry import setting_names
 from d4orm_planners.base.policy import Policy
 from d4orm_planners.play.edits import check_robot
 
@@ -122,18 +121,6 @@ class EpisodeBuffer:
         return motion(problem, trajectory, f"{policy}, {steps * problem.dt:.1f} s", goals=goals, bodies=bodies)
 
 
-class Drivers:
-    """Policies by name, made when they are first needed: some hold threads, so there is one of each."""
-
-    def __init__(self) -> None:
-        self.horizon: int | None = None  #: Steps that policies which predict look ahead, if not their own number
-        self._made = cache(make_policy)
-
-    def policy(self, name: str) -> Policy:
-        settings = {} if self.horizon is None or HORIZON not in setting_names(name) else {HORIZON: self.horizon}
-        return self._made(name, **settings)
-
-
 @dataclass(frozen=True)
 class EpisodeOptions:
     """Common options of all that drive side by side."""
@@ -142,6 +129,10 @@ class EpisodeOptions:
     lifelong: bool = False
     observation: Mapping[str, Any] = field(default_factory=dict)
     disturbances: Sequence[AnyDisturbance] = ()
+    horizon: int | None = None  #: Steps that policies which predict look ahead, if not their own number
+
+    def settings(self, policy: str) -> dict[str, int]:
+        return {} if self.horizon is None or HORIZON not in setting_names(policy) else {HORIZON: self.horizon}
 
 
 class Viewport:
