@@ -131,8 +131,8 @@ class StudyOptions(ObservationOptions):
         return self._run(run_shard, shard=(int(index), int(count)))
 
     def _run(self, run: Callable[..., T], **own: object) -> T:
-        study, kept = self._study(), f"the finished trials are kept in {self.out}"
-        with output_folder(self.out), resumable(kept, enabled=not self.quiet) as progress:
+        study = self._study()
+        with resumable(self.out, "the finished trials", self.quiet) as progress:
             return run(
                 study, self.out, trial_timeout=self.trial_timeout, workers=self.workers, progress=progress, **own
             )

@@ -200,13 +200,13 @@ def parts_progress(enabled: bool = True) -> Iterator[Callable[[str, int, int], N
 
 
 @contextmanager
-def resumable(kept: str, enabled: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """:func:`parts_progress` of what goes on after Ctrl-C where it was; says so then."""
+def resumable(folder: Path, what: str, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """:func:`parts_progress` of what is written to a folder and goes on after Ctrl-C where it was; says so then."""
     try:
-        with parts_progress(enabled) as progress:
+        with output_folder(folder), parts_progress(not quiet) as progress:
             yield progress
     except KeyboardInterrupt:
-        typer.echo(f"stopped; {kept}, the same command goes on from there", err=True)
+        typer.echo(f"stopped; {what} are kept in {folder}, the same command goes on from there", err=True)
         raise
 
 

@@ -36,7 +36,7 @@ from d4orm_planners.cli.options import (
     single_levels,
     takes,
 )
-from d4orm_planners.cli.outputs import output_folder, resumable, tell_results
+from d4orm_planners.cli.outputs import resumable, tell_results
 from d4orm_planners.rl.dataset import Demonstrations
 from d4orm_planners.rl.dataset.write import checked_id, dataset_folder, write_dataset
 
@@ -115,8 +115,7 @@ def train(options: TrainOptions) -> None:
     """Train a policy that all robots share, by reinforcement or imitation; run again to go on where it stopped."""
     learn = _learning(options)
     folder = options.out or Path("runs") / options.algorithm
-    kept = f"the checkpoints are kept in {folder}"
-    with output_folder(folder), resumable(kept, enabled=not options.quiet) as progress:
+    with resumable(folder, "the checkpoints", options.quiet) as progress:
         result = learn(folder, progress=progress, command=shlex.join(["d4orm", *sys.argv[1:]]))
     if not options.quiet:
         best = max(result.curve, key=lambda evaluation: evaluation.rank)
@@ -223,8 +222,7 @@ def dataset(options: DatasetOptions) -> None:
     demonstrations = options.demonstrations()
     name = checked_id(demonstrations.dataset_id if options.dataset_id is None else options.dataset_id)
     folder = options.out or dataset_folder(name)
-    kept = f"the finished episodes are kept in {folder}"
-    with output_folder(folder), resumable(kept, enabled=not options.quiet) as progress:
+    with resumable(folder, "the finished episodes", options.quiet) as progress:
         written = write_dataset(
             demonstrations,
             folder,
