@@ -65,19 +65,29 @@ class Footprint(ABC):
         """Radius of the smallest disc or ball about the reference point that holds it [m]."""
 
     @property
-    @abstractmethod
     def inner_radius(self) -> float:
         """Radius of the largest disc or ball about the reference point within it, zero if there is none [m]."""
+        return min(self.wall_axes)
 
     @property
     def girth(self) -> float:
         """Radius of the smallest upright cylinder about the reference point that holds it [m]."""
-        return self.outer_radius
+        return max(self.semi_axes[:2])
+
+    @property
+    def semi_axes(self) -> tuple[float, float, float]:
+        """Semi-axes of the ball or ellipsoid that it is in space, along x, y and z [m]."""
+        return self.outer_radius, self.outer_radius, self.outer_radius
+
+    @property
+    def wall_axes(self) -> tuple[float, float, float]:
+        """The same of what obstacles and bounds meet."""
+        return self.semi_axes
 
     @property
     def wall_radius(self) -> float:
         """Outer radius of what obstacles and bounds meet [m]."""
-        return self.outer_radius
+        return max(self.wall_axes)
 
     @abstractmethod
     def outline(self) -> Floats:
@@ -96,41 +106,8 @@ class Footprint(ABC):
             object.__setattr__(self, name, number)  # one kind of number in files and comparisons
 
 
-@dataclass(frozen=True)
-class Disc(Footprint):
-    """A disc, or a ball in space."""
-
-    radius: float  #: Radius [m]
-
-    @property
-    def outer_radius(self) -> float:
-        return self.radius
-
-    @property
-    def inner_radius(self) -> float:
-        return self.radius
-
-    @property
-    def semi_axes(self) -> tuple[float, float, float]:
-        """Its radius along each axis, as an ellipsoid's."""
-        return self.radius, self.radius, self.radius
-
-    @property
-    def wall_axes(self) -> tuple[float, float, float]:
-        """The same."""
-        return self.semi_axes
-
-    def outline(self) -> Floats:
-        return self.radius * DIRECTIONS
-
-    @property
-    def core(self) -> Core:
-        """The centre, widened by the radius."""
-        return Core(np.zeros((1, 2)), self.radius)
-
-
 class Planar(Footprint):
-    """A footprint that turns with the robot."""
+    """A footprint in the plane, which turns with the robot."""
 
     def outline(self) -> Floats:
         corners, rounding = self.core
@@ -149,6 +126,26 @@ class Planar(Footprint):
     @property
     def inner_radius(self) -> float:
         return max(0.0, self.core.rounding + float(self.core.axes[1].min()))
+
+
+@dataclass(frozen=True)
+class Disc(Planar):
+    """A disc, or a ball in space."""
+
+    radius: float  #: Radius [m]
+
+    @property
+    def core(self) -> Core:
+        """The centre, widened by the radius."""
+        return Core(np.zeros((1, 2)), self.radius)
+
+    @property
+    def outer_radius(self) -> float:
+        return self.radius
+
+    @property
+    def inner_radius(self) -> float:
+        return self.radius
 
 
 @dataclass(frozen=True)
@@ -251,32 +248,18 @@ class Ellipsoid(Footprint):
 
     @property
     def semi_axes(self) -> tuple[float, float, float]:
-        """Along x, y and z."""
         return self.x, self.y, self.z
 
     @property
     def wall_axes(self) -> tuple[float, float, float]:
-        """The same of what obstacles and bounds meet."""
         return self.semi_axes if self.body is None else (self.body, self.body, self.body)
-
-    @property
-    def girth(self) -> float:
-        return max(self.x, self.y)
-
-    @property
-    def wall_radius(self) -> float:
-        return max(self.wall_axes)
 
     def outline(self) -> Floats:
         return DIRECTIONS * (self.x, self.y)
 
     @property
     def outer_radius(self) -> float:
-        return max(self.x, self.y, self.z)
-
-    @property
-    def inner_radius(self) -> float:
-        return min(self.wall_axes)
+        return max(self.semi_axes)
 
 
 @dataclass(frozen=True, init=False)
@@ -287,14 +270,14 @@ class Train(Footprint):
         ValueError: If one of them is no planar footprint, or the trailers are none or no sequence.
     """
 
-    front: Disc | Planar  #: Of the robot itself
-    trailers: tuple[Disc | Planar, ...]  #: From the front on
+    front: Planar  #: Of the robot itself
+    trailers: tuple[Planar, ...]  #: From the front on
 
-    def __init__(self, front: Disc | Planar, trailers: Sequence[Disc | Planar]) -> None:
+    def __init__(self, front: Planar, trailers: Sequence[Planar]) -> None:
         if isinstance(trailers, str) or not isinstance(trailers, Sequence):
             raise ValueError(f"trailers of Train are {short_repr(trailers)}; give a list of footprints, one each")
         for footprint in (front, *trailers):
-            if not isinstance(footprint, Disc | Planar):
+            if not isinstance(footprint, Planar):
                 raise ValueError(
                     f"Train is made of planar footprints such as Box(0.5, 0.25), not {short_repr(footprint)}"
                 )

@@ -1,15 +1,16 @@
-"""The rigid bodies that a team consists of, robots and their trailers: their poses, and arrays for engines."""
+"""The rigid bodies that a team consists of, robots and their trailers: checks, their poses, and arrays for engines."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import FloatArray, Floats, Ints, read_only, short_repr
-from d4orm_env.dynamics.robot_model import Model
+from d4orm_env.core.arrays import FloatArray, Floats, Ints, frozen_per_robot, read_only, short_repr
+from d4orm_env.dynamics.robot_model import Limit, Model
 from d4orm_env.footprints import MAX_CORNERS, Disc, Ellipsoid, Footprint, Planar, Polygon, Train
 
 
@@ -47,6 +48,50 @@ def checked_footprints(given: Footprint | Sequence[Footprint], models: Sequence[
                 "Train(Box(0.5, 0.25), [Box(0.3, 0.25)])"
             )
     return footprints
+
+
+def discs_of(radii: FloatArray, models: Sequence[Model]) -> list[Footprint]:
+    """Discs of these radii ``(K,)``, and as many behind each as a model has trailers."""
+    discs = [Disc(float(str(size))) for size in radii]  # the decimal that files have
+    pulled = [(disc,) * len(model.trailers) for disc, model in zip(discs, models, strict=True)]
+    return [Train(disc, trailers) if trailers else disc for disc, trailers in zip(discs, pulled, strict=True)]
+
+
+def outer_radius(footprint: Footprint, model: Model, limits: FloatArray) -> float:
+    """Radius of the disc about a robot's reference point that its trailers do not leave either [m]."""
+    radius, distance = footprint.outer_radius, 0.0
+    if isinstance(footprint, Train):
+        for trailer, (_, column) in zip(footprint.trailers, model.trailers, strict=True):
+            distance += float(limits[column])
+            radius = max(radius, distance + trailer.outer_radius)
+    return radius
+
+
+def complete_own_limits(given: Mapping[str, ArrayLike], models: Sequence[Model]) -> dict[str, FloatArray]:
+    """``(K,)`` values by name of every limit that a model has for itself, given or default."""
+    if not isinstance(given, Mapping):
+        raise ValueError(f"own_limits must be a mapping such as {{'wheelbase': 0.3}}, not {short_repr(given)}")
+    known = [{limit.name: limit for limit in model.own_limits} for model in models]
+    names = dict.fromkeys(name for limits in known for name in limits)
+    for name in given:
+        if name not in names:
+            raise ValueError(
+                f"own_limits holds {short_repr(name)}, which no model of the team has; "
+                f"it has {', '.join(names) or 'none of its own'}"
+                f"{'; YAML wants a space after a colon' if ':' in str(name) else ''}"
+            )
+    return {name: _per_robot(name, given.get(name), [limits.get(name) for limits in known]) for name in names}
+
+
+def _per_robot(name: str, value: ArrayLike | None, limits: list[Limit | None]) -> FloatArray:
+    """``(K,)`` values of a limit, given or default, of robots that have it or ``None``."""
+    if value is None:
+        value = [1.0 if limit is None else limit.default for limit in limits]
+    values = frozen_per_robot(value, name, len(limits))
+    for robot, limit in enumerate(limits):
+        if limit is not None and values[robot] > limit.most:
+            raise ValueError(f"{name} of robot_{robot} is {values[robot]:g}; it must be at most {limit.most:g}")
+    return values
 
 
 def find_bodies(footprints: Sequence[Footprint], models: Sequence[Model], hitches: Iterable[float]) -> tuple[Body, ...]:
@@ -134,7 +179,7 @@ def _fill_shape(arrays: FootprintArrays, i: int, footprint: Footprint) -> None:
     arrays.inner[i] = footprint.inner_radius * (1 - 2.0**-20)
     if isinstance(footprint, Disc | Ellipsoid):
         arrays.semi_axes[i], arrays.wall_axes[i] = footprint.semi_axes, footprint.wall_axes
-    if not isinstance(footprint, Disc | Planar):
+    if not isinstance(footprint, Planar):
         return
     corners, rounding = footprint.core
     axes, extents = footprint.core.axes

@@ -28,7 +28,7 @@ def pair_gap(one: Footprint, pose: Floats, other: Footprint, its_pose: Floats) -
     Where a heading is NaN, the disc counts that the footprint covers at any heading.
     """
     if len(pose) == 4:
-        return _ball_gap(its_pose[:3] - pose[:3], _semi_axes(one), _semi_axes(other))
+        return _ball_gap(its_pose[:3] - pose[:3], np.array(one.semi_axes), np.array(other.semi_axes))
     return _core_gap(_placed(one, pose), _placed(other, its_pose))
 
 
@@ -108,7 +108,7 @@ def world_gap(world: World, footprint: Footprint, pose: Floats) -> float:
     """Signed gap of a footprint to the nearest obstacle or bound [m]; see :func:`pair_gap`."""
     dimension, bounds = world.dimension, world.bounds.astype(np.float64)
     if dimension == 3:
-        low = high = np.array(footprint.wall_axes)  # type: ignore[attr-defined] # all in space have them
+        low = high = np.array(footprint.wall_axes)
         gaps = list(_ball_gaps(world, pose[:3], low))
     else:
         core = _placed(footprint, pose)
@@ -117,10 +117,6 @@ def world_gap(world: World, footprint: Footprint, pose: Floats) -> float:
         gaps = [_core_gap(core, obstacle) for obstacle in _obstacles(world)]
     ends = np.concatenate([pose[:dimension] - low - bounds[0], bounds[1] - pose[:dimension] - high])
     return float(min([*ends.tolist(), *gaps]))
-
-
-def _semi_axes(footprint: Footprint) -> Floats:
-    return np.array(footprint.semi_axes)  # type: ignore[attr-defined] # all in space have them
 
 
 def _placed(footprint: Footprint, pose: Floats) -> Core:

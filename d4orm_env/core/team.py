@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from d4orm_env.core import bodies as parts
 from d4orm_env.core.arrays import (
     LARGEST,
     FloatArray,
@@ -22,10 +23,9 @@ from d4orm_env.core.arrays import (
     short_repr,
     whole_number,
 )
-from d4orm_env.core.bodies import Body, FootprintArrays, as_arrays, body_poses, checked_footprints, find_bodies
 from d4orm_env.dynamics.models import get_model
-from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
-from d4orm_env.footprints import Disc, Footprint, Train
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Model
+from d4orm_env.footprints import Disc, Footprint
 
 Flattened = TypeVar("Flattened", FloatArray, Floats)
 
@@ -92,7 +92,7 @@ class Team(Frozen):
         limits = zip(STANDARD_LIMITS, (max_speed, max_acceleration, max_turn_rate), strict=True)
         self._set(models=tuple(models), **{name: frozen_per_robot(value, name, len(models)) for name, value in limits})
         self._set(
-            own_limits=self._complete_own_limits(own_limits),
+            own_limits=parts.complete_own_limits(own_limits, self.robot_models),
             margin=positive_number(margin, "margin", zero_allowed=True, most=LARGEST),
             lag=frozen_per_robot(lag, "lag", len(models), zero_allowed=True),
         )
@@ -100,17 +100,15 @@ class Team(Frozen):
 
     def _set_footprints(self, radius: ArrayLike | None, given: Footprint | Sequence[Footprint] | None) -> None:
         """Set shapes and radius, of which one follows from the other."""
-        count, trailers = len(self.models), [len(model.trailers) for model in self.robot_models]
+        count, models = len(self.models), self.robot_models
         if given is None:
             radii = frozen_per_robot(DEFAULT_RADIUS if radius is None else radius, "radius", count)
-            if not any(trailers):
+            if not any(model.trailers for model in models):
                 self._set(radius=radii, shapes=())
                 return
-            discs = [Disc(float(str(size))) for size in radii]  # the decimal that files have
-            given = [Train(disc, (disc,) * size) if size else disc for disc, size in zip(discs, trailers, strict=True)]
-            radius = None
-        footprints = checked_footprints(given, self.robot_models)
-        outer = [self._outer_radius(robot, footprint) for robot, footprint in enumerate(footprints)]
+            given, radius = parts.discs_of(radii, models), None
+        footprints = parts.checked_footprints(given, models)
+        outer = [parts.outer_radius(*robot) for robot in zip(footprints, models, self.limits, strict=True)]
         radii = frozen_per_robot(outer, "radius", count)
         if radius is not None and (frozen_per_robot(radius, "radius", count) != radii).any():
             raise ValueError(
@@ -118,15 +116,6 @@ class Team(Frozen):
             )
         shaped = not all(isinstance(footprint, Disc) for footprint in footprints)
         self._set(radius=radii, shapes=footprints if shaped else ())
-
-    def _outer_radius(self, robot: int, footprint: Footprint) -> float:
-        """Radius of the disc about a robot's reference point that its trailers do not leave either [m]."""
-        radius, distance = footprint.outer_radius, 0.0
-        if isinstance(footprint, Train):
-            for trailer, (_, column) in zip(footprint.trailers, self.robot_models[robot].trailers, strict=True):
-                distance += float(self.limits[robot, column])
-                radius = max(radius, distance + trailer.outer_radius)
-        return radius
 
     def replace(self, **changes: object) -> Team:
         """A copy with some attributes changed, checked again; of radius and footprint, what is not given follows."""
@@ -168,7 +157,7 @@ class Team(Frozen):
         """
         if not self.shapes or self.dimension == 2:
             return 1.0
-        axes, wider = np.array([shape.semi_axes for shape in self.shapes]), margin / 2  # type: ignore[attr-defined]
+        axes, wider = np.array([shape.semi_axes for shape in self.shapes]), margin / 2
         return float(((axes[:, :2].max(axis=1) + wider) / (axes[:, 2] + wider)).min(initial=1.0))
 
     def flattened(self, positions: Flattened, margin: float) -> Flattened:
@@ -192,19 +181,19 @@ class Team(Frozen):
         return np.where([column is None for column in columns], np.float32(0), turned)
 
     @cached_property
-    def footprint_arrays(self) -> FootprintArrays | None:
+    def footprint_arrays(self) -> parts.FootprintArrays | None:
         """The footprints as the engines read them; ``None`` where all robots are discs, which need none."""
         return self.all_footprint_arrays if self.shapes else None
 
     @cached_property
-    def all_footprint_arrays(self) -> FootprintArrays:
+    def all_footprint_arrays(self) -> parts.FootprintArrays:
         """The same, discs too: for teams that others have other footprints than."""
-        return as_arrays(self.bodies)
+        return parts.as_arrays(self.bodies)
 
     @cached_property
-    def bodies(self) -> tuple[Body, ...]:
+    def bodies(self) -> tuple[parts.Body, ...]:
         """The robots' bodies, and then those of their trailers."""
-        return find_bodies(self.footprint, self.robot_models, self.hitches)
+        return parts.find_bodies(self.footprint, self.robot_models, self.hitches)
 
     @cached_property
     def hitches(self) -> tuple[float, ...]:
@@ -214,21 +203,7 @@ class Team(Frozen):
 
     def body_poses(self, states: FloatArray) -> Floats:
         """``(..., F, d + 1)`` reference points and headings of the bodies in states ``(..., K, n)``."""
-        return body_poses(self.bodies, states, self.dimension)
-
-    def _complete_own_limits(self, given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
-        if not isinstance(given, Mapping):
-            raise ValueError(f"own_limits must be a mapping such as {{'wheelbase': 0.3}}, not {short_repr(given)}")
-        known = [{limit.name: limit for limit in model.own_limits} for model in self.robot_models]
-        names = dict.fromkeys(name for limits in known for name in limits)
-        for name in given:
-            if name not in names:
-                raise ValueError(
-                    f"own_limits holds {short_repr(name)}, which no model of the team has; "
-                    f"it has {', '.join(names) or 'none of its own'}"
-                    f"{'; YAML wants a space after a colon' if ':' in str(name) else ''}"
-                )
-        return {name: _per_robot(name, given.get(name), [limits.get(name) for limits in known]) for name in names}
+        return parts.body_poses(self.bodies, states, self.dimension)
 
     @property
     def num_robots(self) -> int:
@@ -323,14 +298,3 @@ class Team(Frozen):
             footprint=[self.shapes[robot] for robot in index] if self.shapes else None,
             margin=self.margin,
         )
-
-
-def _per_robot(name: str, value: ArrayLike | None, limits: list[Limit | None]) -> FloatArray:
-    """``(K,)`` values of a limit, given or default, of robots that have it or ``None``."""
-    if value is None:
-        value = [1.0 if limit is None else limit.default for limit in limits]
-    values = frozen_per_robot(value, name, len(limits))
-    for robot, limit in enumerate(limits):
-        if limit is not None and values[robot] > limit.most:
-            raise ValueError(f"{name} of robot_{robot} is {values[robot]:g}; it must be at most {limit.most:g}")
-    return values

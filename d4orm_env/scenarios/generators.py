@@ -10,12 +10,13 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import Floats
 from d4orm_env.core.portable import cos, root, sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.layout import Layout, PlacementArea, build, in_space, round_up, scatter
+from d4orm_env.scenarios.layout import Layout, PlacementArea, build, round_up, scatter
 from d4orm_env.scenarios.settings import OBSTACLES, STARTS_AND_GOALS, Settings, bounded, require_dimension
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
@@ -104,8 +105,7 @@ def heterogeneous(settings: Settings, *, diameter: float = 5.0) -> Problem:
         settings: The common arguments, ``model`` left out.
         diameter: Diameter of the circle [m].
     """
-    mixed = mixed_team(settings, first=("differential_drive", 1.0), second=("holonomic2d", 2.0))
-    return circle(mixed, diameter=diameter)
+    return circle(mixed_team(settings, ("differential_drive", 1.0), ("holonomic2d", 2.0)), diameter=diameter)
 
 
 def swap(settings: Settings, *, distance: float = 5.0, spacing: float | None = None) -> Problem:
@@ -130,8 +130,8 @@ def swap(settings: Settings, *, distance: float = 5.0, spacing: float | None = N
     y = np.concatenate([row, row[: settings.num_robots - first]])
     x = np.where(np.arange(settings.num_robots) < first, -distance / 2, distance / 2)
     dimension = settings.team.dimension
-    starts, goals = (in_space(np.column_stack([side, y]), dimension) for side in (x, -x))
-    area = PlacementArea(in_space([distance / 2, first * spacing / 2], dimension)[0])
+    starts, goals = (_in_space(np.column_stack([side, y]), dimension) for side in (x, -x))
+    area = PlacementArea(_in_space([distance / 2, first * spacing / 2], dimension)[0])
     return build(settings, Layout(starts, goals, World(dimension=dimension), distance, area))
 
 
@@ -181,8 +181,7 @@ def paper_heterogeneous(settings: Settings, *, diameter: float = 5.0) -> Problem
         settings: The common arguments, ``model`` left out.
         diameter: Diameter of the circle [m].
     """
-    mixed = mixed_team(settings, first=("holonomic2d", 1.0), second=("differential_drive", 2.0))
-    return circle(mixed, diameter=diameter)
+    return circle(mixed_team(settings, ("holonomic2d", 1.0), ("differential_drive", 2.0)), diameter=diameter)
 
 
 def paper_obstacles(settings: Settings, *, diameter: float = 5.0) -> Problem:
@@ -244,9 +243,15 @@ def antipodal_circle(settings: Settings, diameter: float) -> Layout:
         raise _too_small(settings, "diameter", diameter, needed)
     angle = 2 * math.pi * np.arange(count) / count
     points = diameter / 2 * np.column_stack([cos(angle), sin(angle)])
-    starts, goals = _antipodal(in_space(points, dimension))
-    area = PlacementArea(in_space([diameter / 2, diameter / 2], dimension)[0], is_round=True)
+    starts, goals = _antipodal(_in_space(points, dimension))
+    area = PlacementArea(_in_space([diameter / 2, diameter / 2], dimension)[0], is_round=True)
     return Layout(starts, goals, World(dimension=dimension), diameter, area)
+
+
+def _in_space(points: ArrayLike, dimension: int) -> Floats:
+    """``(., 2)`` points of the plane as ``(., dimension)``: in space, at z = 0."""
+    planar: Floats = np.asarray(points, np.float64).reshape(-1, 2)
+    return planar if dimension == 2 else np.hstack([planar, np.zeros((len(planar), 1))])
 
 
 def _pillars(settings: Settings, centres: Floats, radius: float) -> World:

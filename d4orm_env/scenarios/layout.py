@@ -9,7 +9,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, Floats, as_float32, frozen_array, short_repr
 from d4orm_env.core.portable import arctan2, root
@@ -132,12 +131,6 @@ def _start_states(team: Team, starts: Floats, goals: Floats) -> Floats:
         if model.heading_index is not None:
             states[robot, [model.heading_index, *model.start_angles]] = arctan2(offset[robot, 1], offset[robot, 0])
     return states
-
-
-def in_space(points: ArrayLike, dimension: int) -> Floats:
-    """``(., 2)`` points of the plane as ``(., dimension)``: in space, at z = 0."""
-    planar: Floats = np.asarray(points, np.float64).reshape(-1, 2)
-    return planar if dimension == 2 else np.hstack([planar, np.zeros((len(planar), 1))])
 
 
 def _require_margin(settings: Settings, world: World, starts: Floats, goals: Floats) -> None:

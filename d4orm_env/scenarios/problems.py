@@ -81,25 +81,21 @@ class Scenario:
         return _complain(f"scenario {self.name!r}", {*others, *self.arguments}, names)
 
     def problem(self, num_robots: int | None = None, seed: int | None = None, **arguments: object) -> Problem:
-        """See :func:`make_problem`."""
+        """See :func:`make_problem`; it is checked to be one and to have that many robots."""
         given = {name: value for name, value in arguments.items() if value is not None}
         # Whatever the scenario, leaving a common argument out is no mistake.
         named = (name for name in arguments if name in given or name not in COMMON_ARGUMENTS)
         if complaint := self.complaint(named):
             raise UnknownKeywordError(complaint)
-        return self._make(num_robots, seed, given)
-
-    def _make(self, num_robots: int | None, seed: int | None, settings: Mapping[str, object]) -> Problem:
-        """The problem for that seed, checked to be one and to have that many robots."""
         seed = 0 if seed is None else whole_number(seed, "seed", 0)
         if num_robots is None and all(parameter.default is parameter.empty for parameter in self._parameters[1:2]):
             num_robots = DEFAULT_ROBOTS  # for the generator has no default of its own
         size = () if num_robots is None else (whole_number(num_robots, "num_robots", 1),)
         try:
-            self._signature.bind(seed, *size, **settings)
+            self._signature.bind(seed, *size, **given)
         except TypeError as error:
             raise UnknownKeywordError(f"scenario {self.name!r}: {error}; give it by name") from None
-        problem = self.generator(seed, *size, **settings)
+        problem = self.generator(seed, *size, **given)
         if not isinstance(problem, Problem):
             raise ValueError(
                 f"scenario {self.name!r} returned {short_repr(problem)}; it must return a d4orm_env.Problem"
