@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -162,19 +163,7 @@ class World(Frozen):
     @cached_property
     def shapes(self) -> Shapes:
         """All obstacles as rounded boxes and triangles, in the order circles, spheres, cylinders, boxes, polygons."""
-        d = self.dimension
-        centres, size = self.balls[:, :d], self.balls[:, d:]
-        rows = [np.hstack([centres, centres, size])]
-        if d == 3:
-            end = np.full((len(self.cylinders), 1), np.inf, np.float32)
-            axis, size = self.cylinders[:, :2], self.cylinders[:, 2:]
-            rows.append(np.hstack([axis, -end, axis, end, size]))
-        rows.append(np.hstack([self.boxes, np.zeros((len(self.boxes), 1), np.float32)]))
-        triangles = [
-            corners[np.array(own)].reshape(-1, 6) for corners, own in zip(self.polygons, self.triangles, strict=True)
-        ]
-        angular = np.concatenate([np.empty((0, 6), np.float32), *triangles])
-        return Shapes(*read_only((np.concatenate(rows), angular)))
+        return Shapes(*read_only(shape_tables(self, np)))
 
     @cached_property
     def _indices(self) -> dict[tuple[float, int, float, int, float], WorldIndex]:
@@ -263,6 +252,19 @@ def _polygons(given: Sequence[ArrayLike]) -> tuple[FloatArray, ...]:
         raise ValueError(f"polygons must be a list of polygons, each a list of corners, not {short_repr(given)}")
     corners = (frozen_array(one, f"polygons[{index}]", (None, 2), largest=LARGEST) for index, one in enumerate(given))
     return tuple(corners)
+
+
+def shape_tables(world: World, xp: Any) -> tuple[Any, Any]:
+    """The tables of :class:`Shapes`, by the functions of NumPy, or of JAX for a world whose numbers may be traced."""
+    d, balls, cylinders = world.dimension, xp.asarray(world.balls), xp.asarray(world.cylinders)
+    rows = [xp.concatenate([balls[:, :d], balls], axis=1)]
+    if d == 3:
+        end = xp.full((len(cylinders), 1), xp.inf, xp.float32)
+        rows.append(xp.concatenate([cylinders[:, :2], -end, cylinders[:, :2], end, cylinders[:, 2:]], axis=1))
+    rows.append(xp.pad(xp.asarray(world.boxes), ((0, 0), (0, 1))))
+    pairs = zip(world.polygons, world.triangles, strict=True)
+    triangles = [xp.asarray(corners)[np.array(own)].reshape(-1, 6) for corners, own in pairs]
+    return xp.concatenate(rows), xp.concatenate([xp.zeros((0, 6), xp.float32), *triangles])
 
 
 def world_of(value: object, dimension: int) -> World:

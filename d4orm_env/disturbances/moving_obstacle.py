@@ -25,7 +25,7 @@ from d4orm_env.core.arrays import (
 from d4orm_env.core.files import checked_path
 from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Kept, Scene, level, standard_deviation
+from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Kept, M, Scene, level, standard_deviation
 from d4orm_env.disturbances.draws import Draws
 
 MAX_INTRUDERS = 100
@@ -43,7 +43,19 @@ class Courses(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Intruder(Disturbance[Courses]):
+class _Bodies(Disturbance[M]):
+    """Bodies that are no robots, the first of what is remembered; they change neither states nor controls."""
+
+    @property
+    def replayable(self) -> bool:
+        return True
+
+    def effect(self, memory: M, scene: Scene) -> DisturbanceEffect:
+        return DisturbanceEffect(bodies=memory[0])  # type: ignore[arg-type] # they are float32
+
+
+@dataclass(frozen=True)
+class Intruder(_Bodies[Courses]):
     """Bodies, discs or balls, that cross the team's area on straight lines at constant speed, one after another.
 
     Robots see them as they see robots, and ``env.state()`` ends with them, see :mod:`d4orm_env.envs.joint_state`.
@@ -60,10 +72,6 @@ class Intruder(Disturbance[Courses]):
     count: int = level(partial(whole_number, minimum=0, maximum=MAX_INTRUDERS), 1, off=0)
     speed: float = level(standard_deviation, 0.5)  #: [m/s]
     radius: float = level(_radius, 0.15)  #: [m]
-
-    @property
-    def replayable(self) -> bool:
-        return True  # it changes neither states nor controls
 
     def slack(self, problem: Problem) -> BoundsSlack:
         faster = max(0.0, self.speed - float(problem.team.max_speed.max()))
@@ -92,9 +100,6 @@ class Intruder(Disturbance[Courses]):
             for past, fresh in zip(memory, self._courses(scene.of(worlds), draws.of(worlds))):
                 past[out] = fresh[left]
         return states, controls
-
-    def effect(self, memory: Courses, scene: Scene) -> DisturbanceEffect:
-        return DisturbanceEffect(bodies=memory.bodies)
 
     def _courses(self, scene: Scene, draws: Draws) -> Courses:
         """New lines for all worlds, their bodies at the beginning."""
@@ -132,7 +137,7 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class MovingObstacle(Disturbance[Kept]):
+class MovingObstacle(_Bodies[Kept]):
     """A body, disc or ball, or several, on a given trajectory: it meets robots as an :class:`Intruder` does.
 
     Between the times it moves on straight lines. It is absent before the first time and after the last, and where its
@@ -181,10 +186,6 @@ class MovingObstacle(Disturbance[Kept]):
         return times.tobytes(), positions.shape, positions.tobytes(), self.radius
 
     @property
-    def replayable(self) -> bool:
-        return True  # it changes neither states nor controls
-
-    @property
     def _track(self) -> tuple[Floats, Floats]:
         """``(T,)`` times and ``(T, N, d)`` positions."""
         return np.asarray(self.times), np.asarray(self.positions)
@@ -216,9 +217,6 @@ class MovingObstacle(Disturbance[Kept]):
     ) -> tuple[FloatArray, FloatArray]:
         memory.values[:] = self._at(scene.steps + 1, scene.problem.dt)
         return states, controls
-
-    def effect(self, memory: Kept, scene: Scene) -> DisturbanceEffect:
-        return DisturbanceEffect(bodies=memory.values)
 
     def _at(self, steps: IntArray, dt: float) -> FloatArray:
         """``(B, N, 2 d + 1)`` bodies after ``(B,)`` steps; all zeros for one that is absent."""

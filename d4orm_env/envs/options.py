@@ -167,8 +167,8 @@ class EnvOptions:
         """True if the scenario is known to draw instances that differ in positions and obstacles only."""
         return self.problem is None and find_scenario(self._scenario).draws
 
-    def instances(self) -> tuple[Problem, Callable[[int], Problem] | None]:
-        """The problem to begin with, and ``seed -> Problem`` for drawing others; ``None`` where there is only one.
+    def instances(self) -> tuple[Problem, Callable[..., Problem] | None]:
+        """The problem to begin with, and ``(seed=) -> Problem`` for drawing others; ``None`` where there is only one.
 
         Raises:
             ValueError: If the scenario's arguments are bad, or there is nothing to draw although
@@ -184,8 +184,8 @@ class EnvOptions:
         first = make_problem(self._scenario, **settings)
         if self.randomize_instance is False:
             return first, None
-        draw = partial(_draw, self._scenario, settings)
-        if self.stochastic or draw(0 if self.scenario_settings.get("seed") else 1) != first:
+        draw = partial(make_problem, self._scenario, **settings)
+        if self.stochastic or draw(seed=0 if self.scenario_settings.get("seed") else 1) != first:
             return first, draw
         if self.randomize_instance:
             raise ValueError(
@@ -193,7 +193,3 @@ class EnvOptions:
                 "use a scenario with random starts and goals, or leave randomize_instance off"
             )
         return first, None
-
-
-def _draw(scenario: ScenarioLike, settings: Mapping[str, Any], seed: int) -> Problem:
-    return make_problem(scenario, **(dict(settings) | {"seed": seed}))

@@ -162,7 +162,7 @@ class EnvSetup:
     def draw(self, random: np.random.Generator) -> Problem:
         """A new instance of the scenario, refused if the spaces or the batch of the first one do not hold it."""
         assert self._redraw is not None
-        drawn, old, region = self._redraw(int(random.integers(2**31))), self.problem, self.region
+        drawn, old, region = self._redraw(seed=int(random.integers(2**31))), self.problem, self.region
         points = np.concatenate([drawn.start[:, : old.dimension], drawn.goal])
         team, former = drawn.team, old.team
         same = (team.models, team.shapes) == (former.models, former.shapes)

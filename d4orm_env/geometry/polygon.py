@@ -7,6 +7,7 @@ touches counts as crossing, but for neighbours in the corner that they share.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from fractions import Fraction
 from heapq import heapify, heappop, heappush
 from itertools import pairwise
@@ -207,7 +208,7 @@ class _Sweep:
         """Move the line over a corner; a pair of edges that meet where they must not, if that shows one."""
         position, own = self._corners[corner], ((corner - 1) % self._count, corner)
         begins = [edge for edge in own if self._ends[edge][0] == position]
-        below = self._first_not_below(position)
+        below = bisect_left(self._met, 0, key=lambda edge: -self._side(edge, position))
         above = below
         while above < len(self._met) and self._side(self._met[above], position) == 0:
             if self._met[above] not in own:
@@ -225,16 +226,6 @@ class _Sweep:
             if 0 < index < len(self._met) and self._meet(self._met[index - 1], self._met[index]):
                 return self._met[index - 1], self._met[index]
         return None
-
-    def _first_not_below(self, position: Corner) -> int:
-        low, high = 0, len(self._met)
-        while low < high:
-            middle = (low + high) // 2
-            if self._side(self._met[middle], position) > 0:
-                low = middle + 1
-            else:
-                high = middle
-        return low
 
     def _side(self, edge: int, position: Corner) -> int:
         """1 if a position is above an edge, -1 if it is below."""

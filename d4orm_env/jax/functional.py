@@ -26,7 +26,7 @@ from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.team import Team
-from d4orm_env.core.world import World
+from d4orm_env.core.world import World, shape_tables
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
 from d4orm_env.envs.rewards import RewardFunction, RewardInput, find_reward, term_names, turns_left
@@ -193,6 +193,7 @@ def _arrays(problem: Problem) -> ProblemArrays:
         bounds = jnp.array([[-jnp.inf] * team.dimension, [jnp.inf] * team.dimension], jnp.float32)
     else:
         bounds = jnp.stack([jnp.asarray(world.lower), jnp.asarray(world.upper)])
+    boxes, triangles = shape_tables(world, jnp)
     arrays: dict[str, Any] = {  # traced, which the engine does not mind
         "model_codes": None,
         "limits": _limits(team),
@@ -200,8 +201,8 @@ def _arrays(problem: Problem) -> ProblemArrays:
         "start": start,
         "goal": goal,
         "inverse_initial_distance": 1 / distance,
-        "boxes": _rounded_boxes(world),
-        "triangles": _triangles(world),
+        "boxes": boxes,
+        "triangles": triangles,
         "grid": None,
         "bounds": bounds,
         "time_step": jnp.stack([dt / part for part in (1, 2, 3, 6)]),
@@ -217,25 +218,6 @@ def _arrays(problem: Problem) -> ProblemArrays:
         "wall_radius": jnp.asarray(team.wall_radius),
     }
     return ProblemArrays(**arrays)
-
-
-def _rounded_boxes(world: World) -> jax.Array:
-    """The boxes of :attr:`World.shapes` of a world whose numbers may be traced."""
-    d = world.dimension
-    balls, cylinders = jnp.asarray(world.balls), jnp.asarray(world.cylinders)
-    rows = [jnp.concatenate([balls[:, :d], balls], axis=1)]
-    if d == 3:
-        end = jnp.full((len(cylinders), 1), jnp.inf, jnp.float32)
-        rows.append(jnp.concatenate([cylinders[:, :2], -end, cylinders[:, :2], end, cylinders[:, 2:]], axis=1))
-    rows.append(jnp.pad(jnp.asarray(world.boxes), ((0, 0), (0, 1))))
-    return jnp.concatenate(rows)
-
-
-def _triangles(world: World) -> jax.Array:
-    """The triangles of :attr:`World.shapes` of a world whose numbers may be traced."""
-    pairs = zip(world.polygons, world.triangles, strict=True)
-    corners = [jnp.asarray(polygon)[np.array(own)].reshape(-1, 6) for polygon, own in pairs]
-    return jnp.concatenate([jnp.zeros((0, 6), jnp.float32), *corners])
 
 
 def _limits(team: Team) -> jax.Array:

@@ -14,10 +14,10 @@ from jax import Array
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.bodies import FootprintArrays
+from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine.convex_cores import BISECTIONS
 
-MAX_TRAILERS = 3
 Given: TypeAlias = Array | FloatArray | np.float32
 """Numbers of the problem: inside a compiled function they are traced."""
 
@@ -60,7 +60,7 @@ def _lagging(f: FootprintArrays, turn: Array) -> Array:
     """``(F, S)`` headings of bodies from those of the robots and the hitch angles of the trailers."""
     before, heading = jnp.asarray(f.before), turn
     follows = (before != jnp.arange(len(before)))[:, None]
-    for _ in range(MAX_TRAILERS):
+    for _ in range(MOST_TRAILERS):
         heading = jnp.where(follows, heading[before] - turn, turn)
     return heading
 
@@ -70,7 +70,7 @@ def _hitched(f: FootprintArrays, heading: Array) -> Array:
     before, hitch = jnp.asarray(f.before), jnp.asarray(f.hitch)[None, :, None]
     own = -hitch * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
     offset = own
-    for _ in range(MAX_TRAILERS):
+    for _ in range(MOST_TRAILERS):
         offset = jnp.where(hitch > 0, offset[:, before] + own, 0)
     return offset
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.lines import Line2D
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import DisturbanceEvents
@@ -80,14 +79,3 @@ class MarkLayer:
         one, other = self.panel.right + self.panel.up, self.panel.right - self.panel.up
         crosses = [np.stack([centres - arms * along, centres + arms * along], axis=1) for along in (one, other)]
         self.stalls.set_segments(np.concatenate(crosses))
-
-
-def mark_legend(events: DisturbanceEvents) -> list[Line2D]:
-    """Entries of a legend for what there is."""
-    entries = [
-        (events.pushed.any(), Line2D([], [], color=PUSH, linewidth=1.8, label="push")),
-        (events.stalled.any(), Line2D([], [], linestyle="none", marker="x", color=INK, ms=8, mew=1.8, label="stalls")),
-        (events.bodies.shape[1] > 0, Line2D([], [], linestyle="none", marker="o", mfc=BODY, mec=INK, ms=8,
-                                           label="moving obstacle")),
-    ]  # fmt: skip
-    return [line for shown, line in entries if shown]

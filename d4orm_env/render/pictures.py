@@ -23,13 +23,15 @@ from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.core.summary_line import KeyFigure, count
 from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory, arrival_times
 from d4orm_env.render import own_style
-from d4orm_env.render.event_marks import MarkLayer, mark_legend
+from d4orm_env.render.event_marks import MarkLayer
 from d4orm_env.render.panels import (
+    BODY,
     CONTACT,
     INK,
     MARGIN,
     OBSTACLE,
     OBSTACLE_EDGE,
+    PUSH,
     Array,
     Axes2D,
     TeamLayer,
@@ -118,8 +120,7 @@ def plot_trajectory(
     if title:
         figure.suptitle(title, fontsize=11)
     spacing = {"columnspacing": 1.4, "handletextpad": 0.1, "fontsize": 8.5, "frameon": False}
-    handles = _legend(problem, trajectory) + ([] if events is None else mark_legend(events))
-    figure.legend(handles=handles, loc="outside lower center", ncols=6, **spacing)
+    figure.legend(handles=_legend(problem, trajectory, events), loc="outside lower center", ncols=6, **spacing)
     return figure
 
 
@@ -204,7 +205,8 @@ def _outcome(problem: Problem, trajectory: Trajectory) -> str:
     return f"{problem.name}, {count(robots, 'robot')}: {result}" + (f", {contacts} in contact" if contacts else "")
 
 
-def _legend(problem: Problem, trajectory: Trajectory) -> list[Line2D]:
+def _legend(problem: Problem, trajectory: Trajectory, events: DisturbanceEvents | None) -> list[Line2D]:
+    """Entries for what there is."""
     collided = np.asarray(trajectory.collided)
     missed = np.asarray(trajectory.margin_violated) & ~collided
     mark = partial(Line2D, [], [], linestyle="none")
@@ -216,6 +218,12 @@ def _legend(problem: Problem, trajectory: Trajectory) -> list[Line2D]:
         (collided.any(), mark(label="contact", marker=(8, 1, 0), mfc=CONTACT, mec=CONTACT, ms=9)),
         (missed.any(), mark(label="margin violated", marker="o", mfc=MARGIN, mec=MARGIN, ms=6)),
     ]
+    if events is not None:
+        entries += [
+            (events.pushed.any(), Line2D([], [], color=PUSH, linewidth=1.8, label="push")),
+            (events.stalled.any(), mark(label="stalls", marker="x", color=INK, ms=8, mew=1.8)),
+            (events.bodies.shape[1] > 0, mark(label="moving obstacle", marker="o", mfc=BODY, mec=INK, ms=8)),
+        ]
     return [line for shown, line in entries if shown]
 
 

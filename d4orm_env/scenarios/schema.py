@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, model_validator
 
-from d4orm_env.core.arrays import short_repr
+from d4orm_env.core.arrays import LARGEST_NUMBER, short_repr
 from d4orm_env.core.errors import did_you_mean
 from d4orm_env.core.goal_poses import DEFAULT_TOLERANCE, MOST_TRAILERS
 from d4orm_env.core.portable import arctan2
@@ -28,11 +28,8 @@ from d4orm_env.scenarios.settings import parsed
 FLOAT32_MAX = float(str(np.finfo(np.float32).max))
 VERSION = 1
 
-SQUARED_MAX = 1e18
-"""Largest magnitude whose square, and a sum of such squares, float32 still holds."""
-
 Number = Annotated[float, Field(ge=-FLOAT32_MAX, le=FLOAT32_MAX)]
-Squared = Annotated[float, Field(ge=-SQUARED_MAX, le=SQUARED_MAX)]
+Squared = Annotated[float, Field(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
 Speed = Annotated[float, Field(allow_inf_nan=True)]
 Position = Annotated[list[Squared], Field(min_length=2, max_length=3)]
 PlanarPosition = Annotated[list[Number], Field(min_length=2, max_length=2)]
