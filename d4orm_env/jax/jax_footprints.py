@@ -88,7 +88,7 @@ def bodies_of(f: FootprintArrays | None, robot: Array, num_robots: int) -> Array
     if f is None or len(f.robot) == num_robots:
         return robot[None]
     owner = jnp.asarray(f.robot)
-    rows = jnp.argsort(owner != robot, stable=True)[: 1 + MAX_TRAILERS]
+    rows = jnp.argsort(owner != robot, stable=True)[: 1 + MOST_TRAILERS]
     return jnp.where(owner[rows] == robot, rows, robot)
 
 

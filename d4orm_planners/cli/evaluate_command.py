@@ -30,7 +30,7 @@ from d4orm_planners.cli.options import (
     seed_list,
     takes,
 )
-from d4orm_planners.cli.outputs import check_target, output_folder, resumable, tell_results, tell_written
+from d4orm_planners.cli.outputs import check_target, resumable, tell_results, tell_written
 from d4orm_planners.evaluation.evaluate import run_shard, run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard as page
 from d4orm_planners.evaluation.robustness import tolerance_tables, write_disturbances, write_robustness
