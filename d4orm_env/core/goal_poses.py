@@ -88,6 +88,14 @@ def _goal_hitches(team: Team, given: ArrayLike | None, headings: FloatArray) -> 
     return hitches
 
 
+def goal_headings(problem: Problem) -> int:
+    """Bodies whose headings a problem asks for at goals: none, a robot, and trailers to the last with a hitch angle."""
+    if np.isnan(problem.goal_heading).all():
+        return 0
+    asked = ~np.isnan(problem.goal_hitches).all(axis=0)
+    return 1 + int(np.append(0, 1 + np.flatnonzero(asked)).max())
+
+
 def states_at_goals(problem: Problem) -> FloatArray:
     """``(K, n)`` states of robots at rest at their goals; headings and hitch angles are NaN where any will do."""
     states = np.zeros_like(problem.start)

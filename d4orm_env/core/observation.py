@@ -24,7 +24,8 @@ class Sensed(NamedTuple):
     position: FloatArray  #: ``(K + N, d)``
     velocity: FloatArray  #: ``(K + N, d)``
     radius: FloatArray  #: ``(K + N,)``
-    heading: FloatArray  #: ``(K, 2)`` cosine and sine, zeros for models without a heading
+    #: ``(K, 2 B)`` cosine and sine, zeros for models without a heading, and likewise of hitch angles with goals
+    heading: FloatArray
     arrived: FloatArray  #: ``(K,)`` 0 or 1
     hidden: BoolArray  #: ``(K + N,)`` bool, those that the robot in question does not observe
     ray: FloatArray  #: ``(5, 1)`` scratch for a line of sight
@@ -68,15 +69,16 @@ def _see_itself(k: int, arrays: ProblemArrays, goal: FloatArray, sensed: Sensed,
 
 
 def _see_goal_heading(k: int, directions: FloatArray | None, heading: FloatArray, i: int, out: FloatArray) -> int:
-    """Fill the goal heading less the robot's own, from component ``i`` on, if any has one; return the number of
-    components.
+    """Fill the goal heading and hitch angles less the robot's own, from component ``i`` on, if any has one; return the
+    number of components.
     """
     if directions is None:
         return 0
-    cosine, sine = directions[k, 0], directions[k, 1]
-    out[i] = cosine * heading[k, 0] + sine * heading[k, 1]
-    out[i + 1] = sine * heading[k, 0] - cosine * heading[k, 1]
-    return 2
+    for c in range(0, heading.shape[1], 2):
+        cosine, sine = directions[k, c], directions[k, c + 1]
+        out[i + c] = cosine * heading[k, c] + sine * heading[k, c + 1]
+        out[i + c + 1] = sine * heading[k, c] - cosine * heading[k, c + 1]
+    return heading.shape[1]
 
 
 def _see_robots(k: int, sensed: Sensed, i: int, out: FloatArray) -> None:

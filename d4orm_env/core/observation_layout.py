@@ -12,6 +12,7 @@ import numpy as np
 
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, read_only, whole_number
+from d4orm_env.core.goal_poses import goal_headings
 from d4orm_env.core.problem import Problem
 
 __all__ = ["BoundsSlack", "ObservationLayout"]
@@ -50,6 +51,8 @@ class OwnParts(NamedTuple):
     max_acceleration: slice
     #: cosine and sine of the goal heading less its own, both zero for a robot without one; empty where no robot has one
     goal_heading: slice
+    #: likewise of the hitch angle of each trailer, up to the last that any robot has a goal for
+    goal_hitches: slice
 
 
 class NeighborParts(NamedTuple):
@@ -90,7 +93,8 @@ class ObservationSlices:
     #: one: how far each reaches [m]
     num_rays: int = field(default=0, kw_only=True)
     observed_path: bool = field(default=False, kw_only=True)  #: Whether the path is there
-    goal_headings: bool = field(default=False, kw_only=True)  #: Whether goal headings are, as where any robot has one
+    #: Bodies whose goal headings are: robots where any has one, and trailers, by their hitch angles
+    goal_headings: int = field(default=0, kw_only=True)
 
     def __post_init__(self) -> None:
         for name in ("num_neighbors", "num_obstacles", "num_rays"):
@@ -100,7 +104,8 @@ class ObservationSlices:
     def own(self) -> OwnParts:
         """Slices of the observation."""
         d = self.dimension
-        return OwnParts(*_slices(d, 2, 1, d, 1, 1, 1, 1, 1, 2 * self.goal_headings))
+        turns = 2 * min(self.goal_headings, 1), 2 * max(self.goal_headings - 1, 0)
+        return OwnParts(*_slices(d, 2, 1, d, 1, 1, 1, 1, 1, *turns))
 
     @cached_property
     def neighbor(self) -> NeighborParts:
@@ -156,14 +161,12 @@ class ObservationSlices:
         """``(..., .)`` what observations ``(..., D)`` say of the path; empty where they do not."""
         return observations[..., self.rays.stop :]
 
-    def with_goal_headings(self, observations: FloatArray, wanted: bool) -> FloatArray:
-        """Observations ``(..., D)`` with goal headings, zeros where there were none, or without."""
-        if wanted == self.goal_headings:
-            return observations
-        part = self.own.goal_heading
-        if wanted:
-            return np.insert(observations, [part.start] * 2, 0, axis=-1)
-        return np.delete(observations, part, axis=-1)
+    def with_goal_headings(self, observations: FloatArray, wanted: int) -> FloatArray:
+        """Observations ``(..., D)`` with goal headings of so many bodies, zeros where there were none."""
+        kept, end = self.own.goal_heading.start + 2 * wanted, self.own[-1].stop
+        if kept > end:
+            return np.insert(observations, [end] * (kept - end), 0, axis=-1)
+        return observations if kept == end else np.delete(observations, slice(kept, end), axis=-1)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -208,7 +211,7 @@ class ObservationLayout(ObservationSlices):
         Raises:
             ValueError: If a number makes no sense, or the robots cannot have rays or a line of sight.
         """
-        sizes, turns = (problem.dimension, num_neighbors, num_obstacles), not np.isnan(problem.goal_heading).all()
+        sizes, turns = (problem.dimension, num_neighbors, num_obstacles), goal_headings(problem)
         parts: dict[str, Any] = {"num_rays": num_rays, "observed_path": observed_path, "goal_headings": turns}
         if line_of_sight and problem.dimension != 2:
             raise ValueError("line_of_sight is for the plane, and this problem is in space; leave it out")
@@ -243,7 +246,7 @@ def _bounds(problem: Problem, slices: ObservationSlices, slack: BoundsSlack, ray
     top = speed + slack.speed
     own = _ends(
         slices.own, velocity=top, heading=1, speed=top, goal=farthest, time_left=1, arrived=1, radius=radius,
-        max_speed=speed, max_acceleration=acceleration, goal_heading=1,
+        max_speed=speed, max_acceleration=acceleration, goal_heading=1, goal_hitches=1,
     )  # fmt: skip
     neighbor = _ends(
         slices.neighbor, present=1, position=farthest, velocity=2 * top, radius=max(radius, slack.radius)
@@ -272,5 +275,8 @@ def _slices(*widths: int) -> Iterator[slice]:
 def _component_names(parts: Parts) -> Iterator[str]:
     for name, part in zip(parts._fields, parts, strict=True):
         width = part.stop - part.start
+        if name == "goal_hitches":
+            yield from (f"goal_hitch_{1 + i // 2}_{('cos', 'sin')[i % 2]}" for i in range(width))
+            continue
         several = ("_cos", "_sin") if name.endswith("heading") else ("_x", "_y", "_z")
         yield from (name + suffix for suffix in (("",) if width == 1 else several[:width]))

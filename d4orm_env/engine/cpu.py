@@ -144,8 +144,9 @@ class CpuEngine:
 def _view(layout: ObservationLayout) -> ObservationSpec:
     squared_range = np.float32(layout.communication_range**2)
     return ObservationSpec(
-        layout.bounds, layout.num_neighbors, layout.num_obstacles, squared_range, layout.line_of_sight or None
-    )
+        layout.bounds, layout.num_neighbors, layout.num_obstacles, max(layout.goal_headings, 1), squared_range,
+        layout.line_of_sight or None,
+    )  # fmt: skip
 
 
 def _rolled_out(

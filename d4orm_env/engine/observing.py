@@ -48,6 +48,7 @@ class ObservationSpec(NamedTuple):
     bounds: FloatArray  #: ``(2, D)`` lowest and highest observation
     num_neighbors: int  #: Robots in it
     num_obstacles: int  #: Obstacles in it
+    num_headings: int  #: Bodies of a robot whose headings are needed for it, one at least
     squared_range: np.float32  #: Square of the distance beyond which robots are not observed [m²]
     #: True if those behind obstacles are not observed either, else ``None``, which leaves rays out of a kernel
     line_of_sight: bool | None
@@ -58,7 +59,8 @@ def allocate_sensed(num_robots: int, num_bodies: int, dimension: int, view: Obse
     count = num_robots + num_bodies
     return observation.Sensed(
         np.empty((count, dimension), np.float32), np.empty((count, dimension), np.float32),
-        np.empty(count, np.float32), np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32),
+        np.empty(count, np.float32), np.empty((num_robots, 2 * view.num_headings), np.float32),
+        np.empty(num_robots, np.float32),
         np.zeros(count, np.bool_), np.empty((5, 1), np.float32),
         np.empty((view.num_neighbors, 2), np.float32), np.empty((view.num_obstacles, 2), np.float32),
     )  # fmt: skip

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, IntArray, Whole
 from d4orm_env.core.bodies import FootprintArrays
+from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODEL_CODES, MODELS
@@ -266,13 +267,16 @@ def _motion_reader(model: Model) -> Callable[..., None]:
 def motion_reader(names: tuple[str, ...]) -> MotionReader:
     """``read_motion(arrays, k, s, w, velocity, heading)`` for robots of these models.
 
-    It fills the velocity ``(d,)`` and the heading's cosine and sine ``(2,)`` of robot ``k`` in world ``s``.
+    It fills the velocity ``(d,)`` of robot ``k`` in world ``s``, and ``(2 B,)`` cosine and sine of its heading, zeros
+    without, and of the hitch angles of trailers.
     """
     read_velocity = dispatch({name: _motion_reader(MODELS[name]) for name in names})
-    headings = np.full(1 + max(MODEL_CODES[name] for name in names), -1)
+    headings = np.full((1 + max(MODEL_CODES[name] for name in names), 1 + MOST_TRAILERS), -1)
     for name in names:
-        index = MODELS[name].heading_index
-        headings[MODEL_CODES[name]] = -1 if index is None else index
+        model = MODELS[name]
+        if model.heading_index is not None:
+            own = model.heading_index, *(hitch for hitch, _ in model.trailers)
+            headings[MODEL_CODES[name], : len(own)] = own
 
     @inlined
     def read_motion(
@@ -280,8 +284,9 @@ def motion_reader(names: tuple[str, ...]) -> MotionReader:
     ) -> None:
         code = arrays.model_codes[k]
         read_velocity(code, arrays.limits[k], k * STRIDE, s, w, velocity)
-        index = headings[code]
-        heading[0] = cosine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO
-        heading[1] = sine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO
+        for body in range(heading.shape[0] // 2):
+            index = headings[code, body]
+            heading[2 * body] = cosine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO
+            heading[2 * body + 1] = sine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO
 
     return read_motion

@@ -34,10 +34,10 @@ class Features:
 
     The ``F`` features of an observation are all of order one: velocity (``d``) in units of the speed limit; heading
     (2); direction to the goal (``d``); two functions of the distance to it; share of the time left; radius;
-    acceleration over speed limit; goal heading (2), where observations have it; two functions of the gap along each
-    ray, from the frame's first axis on. For each neighbour: presence, direction (``d``), two functions of the gap,
-    relative velocity (``d``), and, with velocities kept as they are, when the two come closest and how close. For each
-    obstacle: presence, direction (``d``), two functions of the gap.
+    acceleration over speed limit; goal heading and hitch angles (2 each), where observations have them; two
+    functions of the gap along each ray, from the frame's first axis on. For each neighbour: presence, direction
+    (``d``), two functions of the gap, relative velocity (``d``), and, with velocities kept as they are, when the two
+    come closest and how close. For each obstacle: presence, direction (``d``), two functions of the gap.
     """
 
     slices: ObservationSlices  #: Slices of an observation
@@ -154,7 +154,7 @@ class Features:
             observations[:, own.time_left],
             observations[:, own.radius],
             observations[:, own.max_acceleration] / max_speed,
-            observations[:, own.goal_heading],
+            observations[:, own.goal_heading.start : own.goal_hitches.stop],
             *_scales(xp.maximum(rays - observations[:, own.radius], 0)),
             self._neighbors(frame, observations).reshape(count, -1),
             self._obstacles(frame, observations).reshape(count, -1),

@@ -36,7 +36,7 @@ class RewardInput:
     previous_distances: FloatArray  #: ``(..., K)`` to the goals before the step [m]
     distances: FloatArray  #: ``(..., K)`` after it [m]
     initial_distances: FloatArray  #: ``(..., K)`` where the path to the goal began, at least the goal radius [m]
-    #: ``(..., K)`` that are left to the goal headings before the step [rad]; see :func:`turns_left`
+    #: ``(..., K)`` that are left to goal headings and hitch angles before the step [rad]; see :func:`turns_left`
     previous_turns: FloatArray
     turns: FloatArray  #: ``(..., K)`` after it [rad]
     previously_arrived: BoolArray  #: ``(..., K)`` bool: docked before the step
@@ -88,19 +88,25 @@ class RewardInput:
 
 
 def turns_left(problem: Problem, states: ArrayOrTensor, goals: ArrayOrTensor) -> ArrayOrTensor:
-    """``(..., K)`` turns from headings in states ``(..., K, n)`` to goal headings [rad], zero for a robot without one.
+    """``(..., K)`` turns from headings in states ``(..., K, n)`` to goal headings, and of trailers' hitch angles to
+    theirs, summed up [rad]; zero for a robot without one.
 
     On its way a robot turns to the goal ``(..., K, d)`` first, or away from it to back up, and from there to the goal
     heading. These are the angles of M. Aicardi, G. Casalino, A. Bicchi and A. Balestrino, "Closed loop steering of
     unicycle like vehicles via Lyapunov techniques", IEEE Robotics & Automation Magazine, 1995.
     """
-    xp, columns = namespace(states), np.array([model.heading_index or 0 for model in problem.team.robot_models])
-    heading, wanted = states[..., np.arange(len(columns)), columns], xp.nan_to_num(problem.goal_heading)
+    xp, models = namespace(states), problem.team.robot_models
+    robots, columns = np.arange(len(models)), np.array([model.heading_index or 0 for model in models])
+    heading, wanted = states[..., robots, columns], xp.nan_to_num(problem.goal_heading)
     x, y = goals[..., 0] - states[..., 0], goals[..., 1] - states[..., 1]
     ahead = xp.arctan2(y, x)
     by_goal = [_between(heading, faced) + _between(faced, wanted) for faced in (ahead, ahead + np.float32(np.pi))]
     there = x * x + y * y <= problem.goal_radius**2
     left = xp.where(there, _between(heading, wanted), xp.minimum(*by_goal))
+    for number in range(max(len(model.trailers) for model in models)):
+        columns = np.array([model.trailers[number][0] if number < len(model.trailers) else 0 for model in models])
+        missing = _between(states[..., robots, columns], problem.goal_hitches[:, number])
+        left += xp.nan_to_num(missing)
     return xp.where(xp.isnan(problem.goal_heading), np.float32(0), left)
 
 
@@ -128,7 +134,7 @@ class TrainingReward:
     """
 
     #: For every step's distance at full speed towards the goal, and turn at the largest turn rate towards the goal
-    #: heading, as far as the robot has to turn on its way by the goal
+    #: heading, as far as the robot has to turn on its way by the goal, and of trailers towards their goal hitch angles
     progress: float = 0.3
     arrival: float = 5.0  #: Once, on arriving
     margin: float = 1.0  #: Taken off in every step within the margin of anything

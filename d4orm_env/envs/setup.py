@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, Floats, frozen_array, whole_number
+from d4orm_env.core.goal_poses import goal_headings
 from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -172,10 +173,10 @@ class EnvSetup:
                 f"the instance drawn from scenario {drawn.name!r} has another team or lies outside "
                 f"{region.tolist()} m, where the state space ends; use a scenario whose seed changes positions only"
             )
-        if (drawn.arrays.goal_direction is None) == self.layout.goal_headings:
+        if goal_headings(drawn) != self.layout.goal_headings:
             raise ValueError(
-                f"instances of scenario {drawn.name!r} differ in whether any robot has a goal heading, by which "
-                "observations differ; give a goal_heading to some robot of every instance, or to none"
+                f"instances of scenario {drawn.name!r} differ in whether any robot has a goal heading, or goal hitch "
+                "angles, by which observations differ; give them to some robot of every instance, or to none"
             )
         if self.along_paths:
             drawn.shortest_paths.check_reachable()

@@ -35,7 +35,8 @@ def observe_team(
     ``arrays.bounds`` is ``None`` where it has none; ``time_left`` is the share of the time left, 1 to 0.
     """
     position = [world.state[:, axis] for axis in range(layout.dimension)]
-    velocity, heading = _motion(models, arrays, world)
+    velocity, angles = _motion(models, arrays, world, max(layout.goal_headings, 1))
+    heading = angles[:2]
     columns: list[Array | FloatArray] = [
         *velocity,
         *heading,
@@ -46,7 +47,7 @@ def observe_team(
         arrays.radius,
         arrays.limits[:, 0],
         arrays.limits[:, 1],
-        *(_goal_heading(arrays, heading) if layout.goal_headings else ()),
+        *(_goal_headings(arrays, angles) if layout.goal_headings else ()),
         *_neighbors(arrays, position, velocity, layout),
         *_obstacles(arrays, position, layout.num_obstacles),
         *cast_rays(arrays, world.state, position, heading, layout),
@@ -55,10 +56,10 @@ def observe_team(
     return jnp.stack([jnp.clip(column, low[i], high[i]) for i, column in enumerate(columns)], axis=1)
 
 
-def _motion(models: tuple[str, ...], arrays: ProblemArrays, world: Worlds) -> tuple[Columns, Columns]:
-    """Velocities, and cosine and sine of the headings, zeros for models without one."""
+def _motion(models: tuple[str, ...], arrays: ProblemArrays, world: Worlds, bodies: int) -> tuple[Columns, Columns]:
+    """Velocities, and cosine and sine of the headings, zeros for models without one, and of hitch angles."""
     zero = jnp.zeros(len(models), jnp.float32)
-    velocity, heading = [zero] * arrays.goal.shape[1], [zero, zero]
+    velocity, heading = [zero] * arrays.goal.shape[1], [zero, zero] * bodies
     for name in dict.fromkeys(models):
         model = MODELS[name]
         own = np.array(models) == name
@@ -70,16 +71,19 @@ def _motion(models: tuple[str, ...], arrays: ProblemArrays, world: Worlds) -> tu
         for axis, component in enumerate(model.functions.velocity(x, u, limits, OPS)):
             velocity[axis] = jnp.where(own & ~at_rest, component, velocity[axis])
         if model.heading_index is not None:
-            angle = x[model.heading_index]
-            heading = [jnp.where(own, turn(angle), old) for turn, old in zip((jnp.cos, jnp.sin), heading)]
+            for body, i in enumerate((model.heading_index, *(hitch for hitch, _ in model.trailers))[:bodies]):
+                for c, turn in enumerate((jnp.cos, jnp.sin), 2 * body):
+                    heading[c] = jnp.where(own, turn(x[i]), heading[c])
     return velocity, heading
 
 
-def _goal_heading(arrays: ProblemArrays, heading: Columns) -> Columns:
-    """Cosine and sine of the goal headings less robots' own, zeros for robots without one."""
-    directions = jnp.asarray(arrays.goal_direction)
-    (own_cosine, own_sine), (cosine, sine) = heading, (directions[:, 0], directions[:, 1])
-    return [cosine * own_cosine + sine * own_sine, sine * own_cosine - cosine * own_sine]
+def _goal_headings(arrays: ProblemArrays, angles: Columns) -> Columns:
+    """Cosine and sine of the goal headings and hitch angles less robots' own, zeros for robots without one."""
+    directions, columns = jnp.asarray(arrays.goal_direction), []
+    for c in range(0, len(angles), 2):
+        (own_cosine, own_sine), (cosine, sine) = angles[c : c + 2], (directions[:, c], directions[:, c + 1])
+        columns += [cosine * own_cosine + sine * own_sine, sine * own_cosine - cosine * own_sine]
+    return columns
 
 
 class _Nearest(NamedTuple):

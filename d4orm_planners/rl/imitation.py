@@ -217,13 +217,13 @@ class _ImitationRun:
 
 
 def record_samples(
-    env: ParallelEnv, expert: Policy, seed: int, learner: Driver | None = None, *, goal_headings: bool = False
+    env: ParallelEnv, expert: Policy, seed: int, learner: Driver | None = None, *, goal_headings: int = 0
 ) -> Samples:
     """Observations of a team of one model until its robots arrived, and what the expert said they should do.
 
     The expert drives, or a ``learner``, ``(observations (N, D), limits (N, m)) -> controls (N, m)``: then it is asked
-    where that has led the team. With ``goal_headings`` the samples and the learner have these, zeros where there are
-    none.
+    where that has led the team. The samples and the learner have ``goal_headings`` of so many bodies, zeros where there
+    are none.
     """
     observations, _ = env.reset(seed=seed)
     expert.reset(env, seed=seed)

@@ -159,7 +159,7 @@ class LearnedPolicy(Policy):
         """Return observations ``(N, D)`` with goal headings, zeros where there are none, or without, as in training."""
         if seen.shape[1:] != (self._layout.size,):  # of a wrapper
             return seen
-        return self._layout.with_goal_headings(seen, bool(network.header.goal_headings))
+        return self._layout.with_goal_headings(seen, network.features.slices.goal_headings)
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
         robots = acting_robots(self, observations)

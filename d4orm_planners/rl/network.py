@@ -49,7 +49,8 @@ class Header(BaseModel):
     activation: str  #: Between the layers
     squashed: bool  #: Whether the output goes through tanh
     layers: int = Field(ge=1, le=16)  #: Number of layers; those of sets come before them and are not counted
-    goal_headings: Literal[True] | None = None  #: Whether it reads goal headings; ``None`` acts as if there were none
+    #: Whether it reads goal headings, or how many bodies' with trailers; ``None`` acts as if there were none
+    goal_headings: Literal[True, 2, 3, 4] | None = None
     #: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.network`. Such a policy
     #: acts for any number of observed robots
     encoder: Literal["sets"] | None = None
@@ -95,7 +96,7 @@ class Network:
     @property
     def features(self) -> Features:
         head = self.header
-        sizes, turns = (head.dimension, head.num_neighbors, head.num_obstacles), bool(head.goal_headings)
+        sizes, turns = (head.dimension, head.num_neighbors, head.num_obstacles), int(head.goal_headings or 0)
         slices = ObservationSlices(*sizes, num_rays=head.num_rays or 0, goal_headings=turns)
         return replace(Features.of(slices, head.model), frame=head.frame or "goal")
 

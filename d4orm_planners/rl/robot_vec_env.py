@@ -100,7 +100,8 @@ class RobotVecEnv(SharedVecEnv):
             that of each world.
         shortest_paths: Whether robots see their goals along their shortest paths, see :meth:`Features.along`, and
             are paid for progress along these.
-        goal_headings: Whether robots see goal headings, zeros where the problem has none; ``None`` is where it has.
+        goal_headings: Bodies whose goal headings robots see, zeros where the problem has none; ``None`` is as many as
+            it has.
         **kwargs: Further arguments of :class:`d4orm_env.envs.vector_env.NavigationVectorEnv`.
 
     Attributes:
@@ -120,7 +121,7 @@ class RobotVecEnv(SharedVecEnv):
         reward: str | RewardFunction = "training",
         max_observed: int | Sequence[int | None] | None = None,
         shortest_paths: bool = False,
-        goal_headings: bool | None = None,
+        goal_headings: int | None = None,
         **kwargs: Any,
     ) -> None:
         kwargs |= {"reward": reward, "observed_path": shortest_paths, "autoreset_mode": "SameStep"}

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, Field
 
+from d4orm_env.core.goal_poses import goal_headings
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.envs.rewards import TrainingReward
@@ -65,9 +66,9 @@ class TrainConfig(CheckedSettings):
         return {"observed_rays": self.observed_rays, "ray_range": self.ray_range}
 
     @cached_property
-    def goal_headings(self) -> bool:
-        """True if any robot has a goal heading: then all observe theirs, in worlds without any too."""
-        return not np.isnan(self._example().goal_heading).all()
+    def goal_headings(self) -> int:
+        """Bodies whose goal headings are observed: if any robot has one, by all, in worlds without any too."""
+        return goal_headings(self._example())
 
     def task(self, scenario: str, num_robots: int) -> TrainTask:
         """The same scenario with a team of that size."""
@@ -94,7 +95,7 @@ class TrainConfig(CheckedSettings):
             "num_obstacles": slices.num_obstacles,
             "num_rays": slices.num_rays or None,
             "ray_range": self.ray_range if slices.num_rays else None,
-            "goal_headings": slices.goal_headings or None,
+            "goal_headings": True if slices.goal_headings == 1 else slices.goal_headings or None,
             "frame": None if frame == "goal" else frame,
             "shortest_paths": worlds.shortest_paths or None,
             "brakes": bool(np.isfinite(worlds.problem.goal_speed).any()) or None,
@@ -194,10 +195,10 @@ class TrainingSettings(TrainConfig):
         return parse_mixture(self.mixture)
 
     @cached_property
-    def goal_headings(self) -> bool:
+    def goal_headings(self) -> int:
         if not self.mixture:
             return super().goal_headings
-        return any(not np.isnan(task.problem(0, self.model).goal_heading).all() for task in self.tasks)
+        return max(goal_headings(task.problem(0, self.model)) for task in self.tasks)
 
     @property
     def reward(self) -> TrainingReward:

@@ -108,9 +108,9 @@ class _TrainingRun:
             raise ValueError(
                 f"start_from is {path}, whose robots look along their shortest paths; give --shortest-paths"
             )
-        if (theirs := bool(network.header.goal_headings)) != self.settings.goal_headings:
-            does = "reads" if theirs else "reads no"
-            raise ValueError(f"start_from is {path}, which {does} goal headings; give a policy trained with such goals")
+        if (theirs := network.features.slices.goal_headings) != self.settings.goal_headings:
+            does = ("reads no goal headings", "reads goal headings", "reads goal hitch angles")[min(theirs, 2)]
+            raise ValueError(f"start_from is {path}, which {does}; give a policy trained with such goals")
         robots = self.settings.worlds(self.stages[0], 0, 0, {})
         try:  # whether it fits
             normalized = VecNormalize(robots)

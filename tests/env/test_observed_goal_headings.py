@@ -24,6 +24,15 @@ DRIVES = Problem(
     goal_heading=[2.0, -3.0, math.nan],
 )
 """A quarter turn and a little to the left, a little over a quarter of a radian to the left, and any heading."""
+TRAINS = Problem(
+    Team(("car_with_1_trailer", "unicycle", "car_with_3_trailers")),
+    [[0, 0, 0.5, 0.2, 0, 0], [0, 3, 1, 0, 0, 0], [3, 0, 0, 0.1, -0.3, 0.4]],
+    [[2, 0], [2, 3], [4, 0]],
+    goal_heading=[2.0, 1.5, 0.0],
+    goal_hitches=[[0.1, math.nan], [math.nan, math.nan], [math.nan, 0.2]],
+)
+"""A trailer that is bent too far to the right, none, and of three one that is bent to the wrong side."""
+HITCHES = [[math.cos(0.1), -math.sin(0.1), 0, 0], [0, 0, 0, 0], [0, 0, math.cos(0.5), math.sin(0.5)]]
 EXPECTED = [[math.cos(1.5), math.sin(1.5)], [0.96017029, 0.27941550], [0, 0]]
 
 
@@ -67,17 +76,35 @@ def test_where_no_robot_has_one_nothing_is_said_of_it() -> None:
     np.testing.assert_array_equal(without.with_goal_headings(seen[1], wanted=True)[:, 12:14], 0)
 
 
-@pytest.mark.parametrize("egocentric", [False, True])
-def test_all_environments_show_the_same(egocentric: bool) -> None:
-    options: dict[str, Any] = {"problem": DRIVES, "egocentric": egocentric, "max_cycles": 8}
+def test_a_robot_sees_how_its_trailers_have_to_bend() -> None:
+    """As far as any robot's do: the last trailer may arrive as it likes."""
+    env = navigation_v0.parallel_env(problem=TRAINS)
+    seen, layout = stacked(env.reset(seed=0)[0]), env.unwrapped.layout
+    np.testing.assert_allclose(seen[:, layout.own.goal_hitches], HITCHES, atol=1e-6)
+    names = [f"goal_hitch_{number}_{turn}" for number in (1, 2) for turn in ("cos", "sin")]
+    assert layout.names[12:19] == ("goal_heading_cos", "goal_heading_sin", *names, "neighbor_0.present")
+    headings = TRAINS.replace(goal_hitches=None)
+    plain = stacked(navigation_v0.parallel_env(problem=headings).reset(seed=0)[0])
+    np.testing.assert_array_equal(layout.with_goal_headings(seen, 1), plain)
+    np.testing.assert_array_equal(layout.with_goal_headings(seen, 4)[:, 18:20], 0)
+    without = ObservationLayout.for_problem(headings)
+    np.testing.assert_array_equal(without.with_goal_headings(plain, 3)[:, 14:18], 0)
+
+
+@pytest.mark.parametrize(
+    ("problem", "egocentric", "expected"),
+    [(DRIVES, False, EXPECTED), (DRIVES, True, EXPECTED), (TRAINS, False, HITCHES)],
+)
+def test_all_environments_show_the_same(problem: Problem, egocentric: bool, expected: list[list[float]]) -> None:
+    options: dict[str, Any] = {"problem": problem, "egocentric": egocentric, "max_cycles": 8}
     parallel, joint = navigation_v0.parallel_env(**options), JointNavigationEnv(**options)
     by_turns, batched = navigation_v0.env(**options), NavigationVectorEnv(2, **options)
     pure, random = FunctionalEnv(**options), np.random.default_rng(0)
     by_turns.reset(seed=0)
     seen, once, many = stacked(parallel.reset(seed=0)[0]), joint.reset(seed=0)[0], batched.reset(seed=0)[0]
     (state, pure_seen), advance = pure.reset(jax.random.key(0)), jax.jit(pure.advance)
-    first = 11 if egocentric else 12
-    np.testing.assert_allclose(seen[:, first : first + 2], EXPECTED, atol=1e-6)
+    first = 11 if egocentric else 14 if problem is TRAINS else 12
+    np.testing.assert_allclose(seen[:, first : first + len(expected[0])], expected, atol=1e-6)
     for _ in range(6):
         assert all(parallel.observation_space(f"robot_{k}").contains(row) for k, row in enumerate(seen))
         assert joint.observation_space.contains(once)
@@ -109,7 +136,7 @@ def test_literal_features() -> None:
     # Faces left, the goal 3 m up the y axis, where it is to face up: a quarter turn to the right.
     own = [0, 0, -1, 0, 0, 0, 3, 0.25, 0, 0.15, 1, 2, 0, -1]
     neighbor = [1, 0, 1, 0, -0.5, 0.15]
-    features = Features.of(ObservationSlices(2, 1, 0, goal_headings=True), "differential_drive")
+    features = Features.of(ObservationSlices(2, 1, 0, goal_headings=1), "differential_drive")
     seen, _ = features.encode(np.array([own + neighbor], np.float32))
     plain, _ = Features.of(ObservationSlices(2, 1, 0), "differential_drive").encode(
         np.array([own[:-2] + neighbor], np.float32)
@@ -118,6 +145,11 @@ def test_literal_features() -> None:
     assert seen[0, 11:13].tolist() == [0, -1]
     np.testing.assert_array_equal(np.delete(seen, [11, 12], axis=1), plain)
     assert [part.shape[-1] for part in features.parts(seen)] == [13, 9, 5]
+    with_hitches = Features.of(ObservationSlices(2, 1, 0, goal_headings=2), "car_with_1_trailer")
+    bent, _ = with_hitches.encode(np.array([[*own, 0.6, 0.8, *neighbor]], np.float32))
+    np.testing.assert_allclose(bent[0, 13:15], [0.6, 0.8], atol=1e-6)
+    np.testing.assert_array_equal(np.delete(bent, [13, 14], axis=1), seen)
+    assert [part.shape[-1] for part in with_hitches.parts(bent)] == [15, 9, 5]
 
 
 def test_instances_all_have_some_or_none() -> None:
@@ -126,7 +158,22 @@ def test_instances_all_have_some_or_none() -> None:
         return problem.replace(goal_heading=0.5 * seed if seed < 1000 else None)
 
     env = navigation_v0.parallel_env(scenario, 2, randomize_instance=True)
-    with pytest.raises(ValueError, match="differ in whether any robot has a goal heading, by which observations"):
+    with pytest.raises(ValueError, match="differ in whether any robot has a goal heading, or goal hitch angles, by"):
+        env.reset(seed=0)
+
+
+def test_instances_all_have_goal_hitches_or_none() -> None:
+    def scenario(seed: int, num_robots: int) -> Problem:
+        problem = make_problem("random", num_robots, seed=seed, model="car_with_1_trailer")
+        return problem.replace(goal_heading=0.0, goal_hitches=[[0.1], [math.nan if seed < 1000 else 0.2]])
+
+    navigation_v0.parallel_env(scenario, 2, randomize_instance=True).reset(seed=0)
+
+    def mixed(seed: int, num_robots: int) -> Problem:
+        return scenario(seed, num_robots).replace(**({"goal_hitches": None} if seed >= 1000 else {}))
+
+    env = navigation_v0.parallel_env(mixed, 2, randomize_instance=True)
+    with pytest.raises(ValueError, match="differ in whether any robot has a goal heading, or goal hitch angles, by"):
         env.reset(seed=0)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from env_support import act, line_problem, mixed_problem
@@ -14,7 +15,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.disturbances import Disturbance, Intruder
 from d4orm_env.envs.joint_env import JointNavigationEnv
-from d4orm_env.envs.rewards import RewardInput, TrainingReward
+from d4orm_env.envs.rewards import RewardInput, TrainingReward, turns_left
 from d4orm_env.envs.vector_env import NavigationVectorEnv
 from d4orm_planners import make_policy, run_episode
 
@@ -135,6 +136,32 @@ def test_the_training_reward_pays_turns_to_goal_headings() -> None:
     rewards, scale = env.step(act(env, turning))[1], TrainingReward()
     for robot, paid in enumerate([scale.progress, -scale.progress / 2, scale.progress, 0]):
         assert rewards[f"robot_{robot}"] == pytest.approx(paid - scale.time, abs=1e-5)
+
+
+def test_turns_to_goal_hitch_angles_are_left_too() -> None:
+    """Straightening, bending the wrong way round, a second trailer only, and any angle; in JAX the same."""
+    start = [[0, 2 * robot, 0, 0.3, 0.4] for robot in range(4)]
+    options: dict[str, Any] = {
+        "goal_heading": 0.0,
+        "goal_hitches": [[0.0, np.nan], [0.4, np.nan], [np.nan, -0.1], [np.nan, np.nan]],
+    }
+    goals = np.float32([[1, 2 * robot] for robot in range(4)])
+    problem, seen = Problem(Team(("car_with_2_trailers",) * 4), start, goals, **options), []
+
+    def look(step: RewardInput) -> Any:
+        seen.append(step)
+        return step.paper
+
+    env = navigation_v0.parallel_env(problem=problem, reward=look)
+    env.reset(seed=0)
+    env.step(act(env, np.float32([[1, 0]] * 4)))
+    np.testing.assert_allclose(seen[0].previous_turns, [0.3, 0.1, 0.5, 0], atol=1e-6)
+    first, second = seen[0].states[0, 3:]
+    np.testing.assert_allclose(seen[0].turns, [first, 0.4 - first, 0.1 + second, 0], atol=1e-6)
+    assert first < 0.3
+    np.testing.assert_allclose(
+        turns_left(problem, jnp.asarray(start), jnp.asarray(goals)), [0.3, 0.1, 0.5, 0], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("terms", [[np.zeros(2)], {"near": np.zeros(2)}, {"fast": np.zeros(2), "more": np.zeros(2)}])

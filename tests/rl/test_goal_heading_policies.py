@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,25 @@ def test_all_parts_of_a_mixture_tell_them() -> None:
     assert worlds.features.slices.goal_headings
     assert (features[:2, 11:13] != 0).any(axis=1).all()
     assert (features[2:, 11:13] == 0).all()
+
+
+def given(problem: Problem, seed: int, num_robots: int) -> Problem:
+    return problem
+
+
+def test_policies_are_told_goal_hitch_angles_too(trained: Path) -> None:
+    header = load_network(trained).header
+    assert header.goal_headings is True, "files say it as before"
+    told = header.model_copy(update={"goal_headings": 2})
+    assert type(header).model_validate_json(told.text()) == told
+    straight = make_problem("circle", num_robots=2, model="car_with_1_trailer", goal_heading=1.0)
+    bent = straight.replace(goal_hitches=[[0.2], [np.nan]])
+    plain, seen = (RobotVecEnv(1, 2, partial(given, problem)).reset() for problem in (straight, bent))
+    np.testing.assert_array_equal(np.delete(seen, [13, 14], axis=1), plain)
+    np.testing.assert_allclose(seen[:, 13:15], [[np.cos(0.2), np.sin(0.2)], [0, 0]], atol=1e-6)
+    padded = RobotVecEnv(1, 2, partial(given, straight), goal_headings=2).reset()
+    np.testing.assert_array_equal(padded[:, 13:15], 0)
+    np.testing.assert_array_equal(np.delete(padded, [13, 14], axis=1), plain)
 
 
 def test_where_robots_look_along_paths_too() -> None:
