@@ -15,16 +15,11 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
-from d4orm_env.core.bodies import FootprintArrays
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
+from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.engine.caching import cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled
-from d4orm_env.engine.elementary import cosine, sine
-from d4orm_env.engine.footprint_contacts import POSE, touches_static
-from d4orm_env.engine.simd import TILE
 from d4orm_env.envs.joint_state import JointState
+from d4orm_planners.tracking.free_curves import free_curves
 from d4orm_planners.tracking.steering import (
     CREEPING,
     by_model,
@@ -153,77 +148,6 @@ def _within(angle: Floats) -> Floats:
     return angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
 
 
-PARTS = 2  #: Poses that are looked at in what the fastest robot drives in a step
-
-
-def free_curves(problem: Problem, robots: IntArray, poses: Floats, sides: Floats, lengths: Floats) -> IntArray:
-    """``(R,)`` the first curve of each robot that keeps the margin from all obstacles and bounds, or else that touches
-    none; -1 where there is none either, and for robots with trailers, which do not look.
-
-    Args:
-        problem: The problem.
-        robots: ``(R,)`` whose they are.
-        poses: ``(R, 3)`` where they are.
-        sides: ``(W, R, S)`` of the curves' stretches, in the order in which they are preferred.
-        lengths: ``(W, R, S)`` in turning radii; curves with infinite ones are none.
-    """
-    team, chosen = problem.team, np.full(len(robots), -1)
-    # Of one type for all problems.
-    arrays = problem.arrays._replace(turns_at_goals=None, goal_direction=None, squared_goal_chord=None, footprints=None)
-    footprints = team.all_footprint_arrays
-    buffer = np.zeros((2 + POSE * len(footprints.robot)) * TILE, np.float32)
-    for row, robot in enumerate(robots.tolist()):
-        if team.robot_models[robot].trailers:
-            continue
-        radius = float(team.turning_radius[robot])
-        side, length = (np.ascontiguousarray(part[:, row]) for part in (sides, lengths))
-        for extra in (np.float32(problem.margin), ZERO):
-            if chosen[row] < 0:
-                chosen[row] = first_free(
-                    footprints, arrays, robot, extra, radius, problem.stride / PARTS / radius, poses[row], side, length,
-                    buffer,
-                )  # fmt: skip
-    return chosen
-
-
-@compiled
-def _is_clear(
-    f: FootprintArrays, arrays: ProblemArrays, k: Whole, x: float, y: float, heading: float, extra: np.float32,
-    buffer: FloatArray,
-) -> bool:  # fmt: skip
-    poses, o = buffer[2 * TILE :], np.int64(k) * POSE * TILE
-    poses[o], poses[o + TILE] = cosine(np.float32(heading)), sine(np.float32(heading))
-    poses[o + 2 * TILE] = poses[o + 3 * TILE] = ZERO
-    position = (np.float32(x), np.float32(y), ZERO)
-    return not touches_static(f, arrays, k, position, poses, POSE * TILE, 0, extra, buffer)
-
-
-@cached_kernel(**OPTIONS)
-def first_free(
-    f: FootprintArrays, arrays: ProblemArrays, k: int, extra: np.float32, radius: float, apart: float, pose: Floats,
-    sides: Floats, lengths: Floats, buffer: FloatArray,
-) -> int:  # fmt: skip
-    """Look for the first of the curves ``(W, S)`` from a pose that keeps clear, seen every ``apart``; -1 for none."""
-    for w in range(lengths.shape[0]):
-        x, y, heading, free = pose[0], pose[1], pose[2], bool(np.isfinite(lengths[w, 0]))
-        for i in range(lengths.shape[1]):
-            count = int(np.ceil(abs(lengths[w, i]) / apart)) if free else 0
-            for _ in range(count):
-                # The chord of an arc points half-way between the headings at its ends.
-                gone = lengths[w, i] / count
-                half = 0.5 * sides[w, i] * gone
-                chord = 2 * np.float64(sine(np.float32(half))) * sides[w, i] if sides[w, i] != 0 else gone
-                x += radius * chord * np.float64(cosine(np.float32(heading + half)))
-                y += radius * chord * np.float64(sine(np.float32(heading + half)))
-                heading += 2 * half
-                if not _is_clear(f, arrays, k, x, y, heading, extra, buffer):
-                    free = False
-                    break
-        if free:
-            return w
-    return -1
-
-
 TURNING, REVERSING = 1.5, 2.4  #: Angles from heading to velocity at which wheels turn fully, forwards and back [rad]
 STEERING_FIRST = 10.0
 """By how much slower a robot drives while its wheels turn: shares of its pace by curvatures, of the smallest circle."""
@@ -257,7 +181,7 @@ def velocities_to_goals(problem: Problem, states: FloatArray, goals: FloatArray)
     wheels, turns = _curvatures(problem, states)[robots] * radius, problem.goal_heading[robots] - headings
     missed = np.minimum(problem.goal_heading_tolerance[robots], problem.goal_radius / radius)
     walls = problem.world.num_obstacles or problem.world.lower is not None
-    choose = partial(free_curves, problem, robots, np.column_stack([states[robots, :2], headings])) if walls else None
+    choose = partial(free_curves, problem, robots, _poses(problem, states)[robots]) if walls else None
     side, length, free[robots] = first_stretches(ahead, left, turns, UNNOTICED * missed, wheels, choose)
     aims, turn = goals.copy(), side * np.where(length < 0, -REVERSING, TURNING)
     away = np.stack([np.abs(length) * radius, np.zeros_like(radius)], axis=1)
@@ -272,6 +196,16 @@ def curving(problem: Problem) -> BoolArray:
     """``(K,)`` robots with a goal heading that turn only as they drive."""
     circle = problem.team.turning_radius
     return ~np.isnan(problem.goal_heading) & (circle > 0) & np.isfinite(circle)
+
+
+def _poses(problem: Problem, states: FloatArray) -> Floats:
+    """``(K, 3 + T)`` positions, headings and hitch angles."""
+    poses = np.zeros((problem.num_robots, 3 + MOST_TRAILERS))
+    poses[:, :2], poses[:, 2] = states[:, :2], problem.team.headings(states)
+    for model, robots in by_model(problem):
+        for number, (hitch, _) in enumerate(model.trailers, 3):
+            poses[robots, number] = states[robots, hitch]
+    return poses
 
 
 def _turned(vectors: Floats, angles: Floats) -> Floats:

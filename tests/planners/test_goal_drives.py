@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from d4orm_env import Problem, Team, World, navigation_v0
+from d4orm_env.core.bodies import body_poses
 from d4orm_env.core.gaps import world_gap
 from d4orm_env.engine.choice import get_engine
-from d4orm_env.footprints import Box
+from d4orm_env.footprints import Box, Train
 from d4orm_planners import run_episode
 from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
-from d4orm_planners.tracking.goal_drives import CUSP, STRAIGHT, curves, drive_to_goal, first_stretches, free_curves
-from d4orm_planners.tracking.steering import preferred_velocities, track_velocities
+from d4orm_planners.tracking.free_curves import free_curves
+from d4orm_planners.tracking.goal_drives import CUSP, STRAIGHT, curves, drive_to_goal, first_stretches
+from d4orm_planners.tracking.steering import advanced, preferred_velocities, track_velocities
 
 CARS = ("car", "car_first_order", "car_with_1_trailer", "car_with_3_trailers")
 TURNS = {"ahead": 0.0, "opposite": np.pi, "sideways": np.pi / 2}
@@ -79,26 +81,33 @@ def test_cars_arrive_with_their_headings(model: str, turn: float) -> None:
 
 
 def gap_along(problem: Problem, pose: np.ndarray, sides: np.ndarray, lengths: np.ndarray) -> float:
-    """Least gap of a car to the world on a curve, in fine steps."""
-    radius, least = float(problem.team.turning_radius[0]), np.inf
-    end = np.array([pose[0] / radius, pose[1] / radius, pose[2]])
+    """Least gap of a car and its trailers to the world on a curve, as its model drives in fine steps."""
+    radius, least, steps = float(problem.team.turning_radius[0]), np.inf, 60
+    fine, states = problem.replace(dt=1 / steps), pose[None].astype(np.float32)
     for side, length in zip(sides, lengths):
-        for share in np.linspace(0, 1, 60)[1:]:
-            x, y, heading = driven(end, side, share * length)
-            least = min(
-                least, world_gap(problem.world, problem.team.footprint[0], np.array([x * radius, y * radius, heading]))
-            )
-        end = driven(end, side, length)
+        controls = np.float32([[length * radius, side * problem.team.own_limits["max_steering"][0]]])
+        for _ in range(steps if length else 0):
+            states = advanced(fine, states, controls)
+            bodies = zip(problem.team.bodies, body_poses(problem.team.bodies, states, 2))
+            least = min(least, *(world_gap(problem.world, body.footprint, end) for body, end in bodies))
     return least
 
 
-def test_the_shortest_free_curve_is_taken() -> None:
+FOOTPRINTS = {
+    "car_first_order": Box(0.36, 0.24, 0.1),
+    "car_with_2_trailers": Train(Box(0.36, 0.24, 0.1), [Box(0.3, 0.2), Box(0.2, 0.2)]),
+}
+
+
+@pytest.mark.parametrize("model", FOOTPRINTS)
+def test_the_shortest_free_curve_is_taken(model: str) -> None:
     world = World(2, boxes=[[-3, -2, 3, -0.3]], lower=[-3, -3], upper=[3, 3])
-    team, chosen = Team(("car_first_order",), footprint=Box(0.36, 0.24, 0.1)), []
+    team, chosen = Team((model,), footprint=FOOTPRINTS[model]), []
+    hitches = [-0.3, 0.5][: len(team.robot_models[0].trailers)]
     radius, none = float(team.turning_radius[0]), np.zeros(1)
     for x, y, heading in zip(*poses(10, 1.5)):
-        pose = np.array([x, abs(y), heading])
-        problem = Problem(team, [pose], [[0, 0]], goal_heading=0.0, world=world)
+        pose = np.array([x, abs(y), heading, *hitches])
+        problem = Problem(team, [[0, 0, 0, *hitches]], [[0, 0]], goal_heading=0.0, world=world)
         away, turned = (
             -pose[:2] / radius,
             np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]]),
