@@ -21,7 +21,7 @@ from d4orm_env.engine.observing import communication_links
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.settings import CheckedSettings, NotNegative, Positive, Whole
-from d4orm_planners.tracking.goal_drives import curving, velocities_to_goals
+from d4orm_planners.tracking.goal_drives import curving, curving_room, velocities_to_goals
 from d4orm_planners.tracking.steering import (
     goals_along_paths,
     preferred_velocities,
@@ -92,7 +92,7 @@ class Orca(StatePolicy):
         preferred = np.einsum("ijk,kj->ki", self._turn, preferred_velocities(problem, joint.states, aims))
         if (by_curves := curving(problem)).any():
             left, bend = (np.linalg.norm(joint.goals - points, axis=1) for points in (joint.states[:, :2], aims))
-            by_curves &= (left < NEARBY * problem.team.turning_radius) & (bend <= problem.goal_radius)
+            by_curves &= (left < curving_room(problem, NEARBY)) & (bend <= problem.goal_radius)
             own, free = velocities_to_goals(problem, joint.states, joint.goals)
             preferred = np.where(by_curves[:, None], own, preferred)
             by_curves &= free

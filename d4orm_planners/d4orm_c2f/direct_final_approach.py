@@ -10,7 +10,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.types import Engine
-from d4orm_planners.tracking.goal_drives import drive_to_goal
+from d4orm_planners.tracking.goal_drives import curving_room, drive_to_goal
 from d4orm_planners.tracking.steering import NEAR_VIA, at_rest, drives, straight_drives
 
 PASSING = 1 / 75_000  #: Share of the goal radius that is the arrival radius of robots that drive through their goals
@@ -46,7 +46,7 @@ def direct_final_approach(
     speed, acceleration = (window.team.limits[:, limit, None] for limit in (SPEED, ACCELERATION))
     circle = window.team.turning_radius
     turning = (circle > 0) & np.isfinite(circle) & (window.dimension == 2)
-    close = turning & ~arrived & (away[:, 0] < NEARBY * circle)
+    close = turning & ~arrived & (away[:, 0] < curving_room(window, NEARBY))
     near = near & (away <= speed * window.dt * window.horizon)[:, 0]
     final = np.zeros_like(near)
     if not (near | close).any():

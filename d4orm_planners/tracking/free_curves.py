@@ -1,4 +1,4 @@
-"""Curves along which a robot and its trailers keep clear of obstacles and bounds."""
+"""Curves along which a robot and its trailers keep clear of obstacles and bounds, to goal hitch angles."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from d4orm_env.engine.elementary import cosine, sine
 from d4orm_env.engine.footprint_contacts import POSE, touches_static
 from d4orm_env.engine.simd import TILE
 
+SURE = 0.5  #: Share of the tolerance of hitch angles that they may be missed by where a curve ends
 PARTS = 2  #: Poses that are looked at in what the fastest robot drives in a step, and in the length of a hitch
 
 
 def free_curves(problem: Problem, robots: IntArray, poses: Floats, sides: Floats, lengths: Floats) -> IntArray:
     """``(R,)`` the first curve of each robot that keeps the margin from all obstacles and bounds, or else that touches
-    none, trailers included; -1 where there is none either.
+    none, trailers included, and ends with them as the goal asks, or else with any hitch angles; -1 where there is none.
 
     Args:
         problem: The problem.
@@ -38,11 +39,14 @@ def free_curves(problem: Problem, robots: IntArray, poses: Floats, sides: Floats
         radius, (largest, shortest) = float(team.turning_radius[robot]), _hitches(problem, robot)
         apart = min(problem.stride, shortest) / PARTS / radius
         side, length = (np.ascontiguousarray(part[:, row]) for part in (sides, lengths))
-        for extra in (np.float32(problem.margin), ZERO):
-            if chosen[row] < 0:
-                chosen[row] = first_free(
-                    footprints, arrays, robot, extra, radius, apart, poses[row], largest, side, length, buffer
-                )
+        asked, missed = problem.goal_hitches[robot], SURE * float(problem.goal_heading_tolerance[robot])
+        for bends in (asked, np.full_like(asked, np.nan)):
+            for extra in (np.float32(problem.margin), ZERO):
+                if chosen[row] < 0:
+                    chosen[row] = first_free(
+                        footprints, arrays, robot, extra, radius, apart, poses[row], largest, side, length, bends,
+                        missed, buffer,
+                    )  # fmt: skip
     return chosen
 
 
@@ -88,9 +92,11 @@ def _is_clear(
 @cached_kernel(**OPTIONS)
 def first_free(
     f: FootprintArrays, arrays: ProblemArrays, k: int, extra: np.float32, radius: float, apart: float, begin: Floats,
-    largest: Floats, sides: Floats, lengths: Floats, buffer: FloatArray,
+    largest: Floats, sides: Floats, lengths: Floats, asked: FloatArray, missed: float, buffer: FloatArray,
 ) -> int:  # fmt: skip
-    """Look for the first of the curves ``(W, S)`` from a pose that keeps clear, seen every ``apart``; -1 for none."""
+    """Look for the first of the curves ``(W, S)`` from a pose that keeps clear, seen every ``apart``, and that misses
+    the hitch angles ``asked``, NaN for any, by no more than that; -1 for none.
+    """
     for w in range(lengths.shape[0]):
         pose, free = begin.copy(), bool(np.isfinite(lengths[w, 0]))
         for i in range(lengths.shape[1]):
@@ -107,6 +113,8 @@ def first_free(
                 if not _is_clear(f, arrays, k, pose, extra, buffer):
                     free = False
                     break
+        for n in range(pose.shape[0] - 3):
+            free &= not abs(pose[3 + n] - asked[n]) > missed
         if free:
             return w
     return -1

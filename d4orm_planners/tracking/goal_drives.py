@@ -48,7 +48,7 @@ class FirstStretch(NamedTuple):
 
 def first_stretches(
     ahead: Floats, left: Floats, turns: Floats, short: Floats, wheels: Floats,
-    choose: Callable[[Floats, Floats], IntArray] | None = None,
+    choose: Callable[[Floats, Floats], IntArray] | None = None, runs: Floats | None = None,
 ) -> FirstStretch:  # fmt: skip
     """First stretches of the shortest curves.
 
@@ -60,8 +60,9 @@ def first_stretches(
         wheels: ``(K,)`` present curvatures; NaN for robots that take any at once.
         choose: ``(K,)`` which is taken of the sides and lengths ``(W, K, 5)`` of all curves, the shortest first; -1
             for none, and so for the shortest.
+        runs: ``(V, K)`` lengths of straights at their ends; none by default.
     """
-    sides, lengths = curves(ahead, left, turns, short)
+    sides, lengths = curves(ahead, left, turns, short) if runs is None else _run_in(ahead, left, turns, short, runs)
     gears = np.where(np.abs(lengths) > short[:, None], np.sign(lengths), 0.0)
     costs, first = np.abs(lengths).sum(axis=-1), (gears != 0).argmax(axis=-1)
     gear, side, inert = np.zeros_like(costs), np.broadcast_to(wheels, costs.shape), ~np.isnan(wheels)
@@ -97,6 +98,15 @@ def curves(ahead: Floats, left: Floats, turns: Floats, short: Floats) -> tuple[F
             sides.append(side[..., order])
             lengths.append(np.where(exists[..., None], row, np.inf)[..., order])
     return np.concatenate(sides), np.concatenate(lengths)
+
+
+def _run_in(ahead: Floats, left: Floats, turns: Floats, short: Floats, runs: Floats) -> tuple[Floats, Floats]:
+    """The same, ``(V W, K, 6)``, of curves that end by straights forwards."""
+    sine, cosine = portable.sin(turns), portable.cos(turns)
+    found = [curves(ahead - run * cosine, left - run * sine, turns, short) for run in runs]
+    sides, lengths = (np.concatenate(part) for part in zip(*found, strict=True))
+    last = np.repeat(runs, len(lengths) // len(runs), axis=0)[..., None]
+    return np.concatenate([sides, 0 * last], axis=-1), np.concatenate([lengths, last], axis=-1)
 
 
 def _words(x: Floats, y: Floats, turn: Floats, sine: Floats, cosine: Floats, short: Floats) -> list[Word]:
@@ -151,6 +161,8 @@ def _within(angle: Floats) -> Floats:
 TURNING, REVERSING = 1.5, 2.4  #: Angles from heading to velocity at which wheels turn fully, forwards and back [rad]
 STEERING_FIRST = 10.0
 """By how much slower a robot drives while its wheels turn: shares of its pace by curvatures, of the smallest circle."""
+RUNS = 0.0, 1.0, 2.0, 3.0, 5.0
+"""Lengths of straights at the ends of curves, on which trailers come into line: sums of their hitches' lengths."""
 UNNOTICED = 0.08  #: Share of what may be missed at a goal up to which a stretch on the way there is left out
 
 
@@ -167,8 +179,8 @@ def brake_to_dock(problem: Problem, robots: list[int], controls: FloatArray, joi
 
 def velocities_to_goals(problem: Problem, states: FloatArray, goals: FloatArray) -> tuple[FloatArray, BoolArray]:
     """``(K, d)`` velocities [m/s] to goals ``(K, d)`` [m], as :func:`preferred_velocities`; along the shortest free
-    curves, from arc to arc, to goal headings of robots that turn only as they drive. And ``(K,)`` whose curves are free
-    of the obstacles that there are.
+    curves, from arc to arc, to goal headings, and hitch angles, of robots that turn only as they drive. And ``(K,)``
+    whose curves are free of the obstacles that there are.
 
     Nothing is remembered: where a robot does not follow a curve, it goes on by the one from where it is.
     """
@@ -180,9 +192,11 @@ def velocities_to_goals(problem: Problem, states: FloatArray, goals: FloatArray)
     ahead, left = _turned((goals - states[:, :2])[robots].astype(np.float64), -headings).T / radius
     wheels, turns = _curvatures(problem, states)[robots] * radius, problem.goal_heading[robots] - headings
     missed = np.minimum(problem.goal_heading_tolerance[robots], problem.goal_radius / radius)
-    walls = problem.world.num_obstacles or problem.world.lower is not None
-    choose = partial(free_curves, problem, robots, _poses(problem, states)[robots]) if walls else None
-    side, length, free[robots] = first_stretches(ahead, left, turns, UNNOTICED * missed, wheels, choose)
+    walls, trains = problem.world.num_obstacles or problem.world.lower is not None, _trains(problem)[robots]
+    runs = np.outer(RUNS, trains / radius) if trains.any() else None
+    looks = bool(walls) or runs is not None
+    choose = partial(free_curves, problem, robots, _poses(problem, states)[robots]) if looks else None
+    side, length, free[robots] = first_stretches(ahead, left, turns, UNNOTICED * missed, wheels, choose, runs)
     aims, turn = goals.copy(), side * np.where(length < 0, -REVERSING, TURNING)
     away = np.stack([np.abs(length) * radius, np.zeros_like(radius)], axis=1)
     aims[robots] = states[robots, :2] + _turned(away, headings + turn)
@@ -196,6 +210,18 @@ def curving(problem: Problem) -> BoolArray:
     """``(K,)`` robots with a goal heading that turn only as they drive."""
     circle = problem.team.turning_radius
     return ~np.isnan(problem.goal_heading) & (circle > 0) & np.isfinite(circle)
+
+
+def curving_room(problem: Problem, circles: float) -> Floats:
+    """``(K,)`` so many turning radii and the longest straight on which trailers come into line [m]."""
+    return circles * problem.team.turning_radius + RUNS[-1] * _trains(problem)
+
+
+def _trains(problem: Problem) -> Floats:
+    """``(K,)`` lengths of all hitches of robots with goal hitch angles [m]; zero for others."""
+    models = zip(problem.team.robot_models, problem.team.limits, strict=True)
+    lengths = np.array([sum(float(limits[column]) for _, column in model.trailers) for model, limits in models])
+    return np.where(np.isnan(problem.goal_hitches).all(axis=1), 0.0, lengths)
 
 
 def _poses(problem: Problem, states: FloatArray) -> Floats:
