@@ -10,6 +10,8 @@ import pytest
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.footprints import Box, Disc, Train
 from d4orm_env.scenarios import list_scenarios
 
 
@@ -92,6 +94,19 @@ def mixed_problem() -> Problem:
     )
     start = [[0, 0, 0, 0], [1, 0, 0.5, 0], [2, 0, 0.1, -0.2]]
     return Problem(team, start, [[0.1, 0.1], [1.1, 0.1], [2.0, 0.2]], horizon=60)
+
+
+def trains() -> Problem:
+    """Trailers, footprints, limits that are not symmetric, and goal headings and hitch angles in one team, at goals."""
+    shapes = Train(Box(0.5, 0.25, 0.1), [Box(0.3, 0.25), Disc(0.1)]), Box(0.6, 0.2), Train(Disc(0.15), [Box(0.3, 0.2)])
+    own = {"max_reverse_speed": [0.4, 0.2, 0.6], "max_right_turn_rate": 0.3, "hitch_length_1": 0.4}
+    team = Team(("car_with_2_trailers", "unicycle1", "car_with_1_trailer"), footprint=shapes, own_limits=own)
+    triangle = [[0.5, -1], [1.1, -1.2], [0.8, -0.5]]
+    world = World(boxes=[[-1.2, -1, -0.8, 0.2]], polygons=[triangle], lower=[-3, -3], upper=[3.2, 3.1])
+    start = [[-1.6, -0.6, 1.5, 0.1, -0.2], [0, -1.5, 1.5, 0, 0], [1.5, 0.3, 1.5, 0.5, 0]]
+    goals, asked = [[-1.6, -0.55], [0, -1.45], [1.5, 0.35]], [[0.2, np.nan], [np.nan] * 2, [0.0, np.nan]]
+    options: dict[str, Any] = {"goal_heading": 1.6, "goal_heading_tolerance": 0.4, "goal_hitches": asked}
+    return Problem(team, start, goals, world, horizon=25, **options)
 
 
 def straight_drive(problem: Problem, throttle: Any = 1.0) -> np.ndarray:

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 import pytest
 from engine_support import ENGINE_NAMES, MODEL_NAMES, NUMPY_OPS, open_problem, random_controls, toward_goals
-from env_support import mixed_problem, scenario_params
+from env_support import mixed_problem, scenario_params, trains
 
 from d4orm_env import rollout
 from d4orm_env.core.problem import Problem
@@ -114,6 +114,7 @@ TEAMS = {
         for name in MODEL_NAMES
     },
     "mixed": mixed_problem(),
+    "trains": trains(),
 }
 
 

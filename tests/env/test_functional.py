@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from engine_support import ENGINE_NAMES, MODEL_NAMES, random_controls
-from env_support import mixed_problem, slow
+from env_support import mixed_problem, slow, trains
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
@@ -34,6 +34,7 @@ PROBLEMS = {
     "mixed": mixed_problem().replace(horizon=25),
     "obstacles": OBSTACLES,
     "space": make_problem("amswarm_4", horizon=25),
+    "trains": trains(),
 }
 
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from env_support import trains
 
 from d4orm_env import make_problem, navigation_v0
 from d4orm_env.core.problem import Problem
@@ -51,6 +52,7 @@ CASES: dict[str, tuple[str, Callable[[], Problem]]] = {
         "training",
         lambda: mixture(MIXTURES[0]).replace(goal_heading=[np.nan, 2.0, np.nan, np.nan]),
     ),
+    "trains": ("training", trains),
     "space": ("paper", lambda: apart(make_problem("sphere", num_robots=2))),
     "boxes": ("training", lambda: apart(make_problem("four_obstacles", num_robots=3))),
     "triangles": ("training", lambda: apart(make_problem("circle", num_robots=2)).replace(world=TRIANGLES)),
@@ -59,7 +61,10 @@ CASES: dict[str, tuple[str, Callable[[], Problem]]] = {
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=pytest.mark.slow if "car" in name or "unicycle" in name else []) for name in CASES],
+    [
+        pytest.param(name, marks=pytest.mark.slow if "car" in name or "unicycle" in name or name == "trains" else [])
+        for name in CASES
+    ],
 )
 def test_it_observes_and_rewards_as_the_environments_do(name: str) -> None:
     reward, make = CASES[name]
