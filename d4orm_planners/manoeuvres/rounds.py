@@ -21,9 +21,10 @@ from d4orm_planners.manoeuvres.search import curve_from, find_motion
 from d4orm_planners.manoeuvres.team import TeamMotions
 from d4orm_planners.mapf.lns import search_neighbourhoods
 
-ROUNDS = 200
-"""Neighbourhoods that are replanned to find a motion for everybody, after a quarter of them with late departures; and
-once more as many with detours, where robots have to let each other by somewhere that is on nobody's way."""
+ROUNDS, FIRST_ROUNDS, FIRST_PER_ROBOT = 400, 50, 4
+"""Neighbourhoods that are replanned to find a motion for everybody; the most at first, and of a small team so many for
+each robot. From then on every other one has late departures, and every other one detours, where robots have to let each
+other by somewhere that is on nobody's way: which of them leads on is not known."""
 BETTER_ROUNDS = 16
 """Neighbourhoods that are replanned in an iteration once everybody has one."""
 
@@ -69,10 +70,11 @@ def find_manoeuvres(search: SolveRun) -> TeamMotions | None:
 def _complete(search: SolveRun, motions: TeamMotions) -> bool:
     """Replan neighbourhoods of robots without a motion until there are none; return whether that is so."""
     random = np.random.default_rng(search.iteration_seed(Stream.NEIGHBOURHOODS))
-    for number in range(2 * ROUNDS):
+    first = min(FIRST_ROUNDS, FIRST_PER_ROBOT * len(motions.robots))
+    for number in range(ROUNDS):
         if not motions.missing or search.should_stop():
             break
-        motions.late, motions.detours = ROUNDS // 4 <= number < ROUNDS, number >= ROUNDS
+        motions.late, motions.detours = number >= first and number % 2 == 0, number >= first and number % 2 == 1
         search_neighbourhoods(motions, random, 1, search.should_stop)
     motions.late = motions.detours = False
     return not motions.missing

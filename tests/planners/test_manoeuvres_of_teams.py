@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from env_support import slow
@@ -12,9 +14,11 @@ from d4orm_env.core.world import World
 from d4orm_env.footprints import Box, Train
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
+from d4orm_planners.manoeuvres import rounds as team_rounds
 from d4orm_planners.manoeuvres import team as team_motions
 from d4orm_planners.manoeuvres.fixed_path import on_fixed_path
 from d4orm_planners.manoeuvres.team import TeamMotions
+from d4orm_planners.mapf.lns import search_neighbourhoods
 
 
 def test_a_car_waits_for_another_one_to_leave_the_gap_that_it_parks_in(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,6 +75,26 @@ def test_one_of_two_that_change_places_beside_a_bay_goes_into_it(model: str) -> 
     assert plan.verified
     assert (plan.iterations, plan.denoising_steps) == (1, 0)
     assert plan.trajectory.positions[..., 0].max() > 1.95
+
+
+@pytest.mark.parametrize("model", ["unicycle", slow("car_first_order")])
+def test_two_pass_each_other_in_a_corridor_soon(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both drive in its middle, where nobody passes: one has to keep to a side, which is on nobody's way either."""
+    rounds: list[int] = []
+
+    def search(motions: TeamMotions, random: np.random.Generator, count: int, should_stop: Callable[[], bool]) -> None:
+        rounds.append(motions.missing)
+        search_neighbourhoods(motions, random, count, should_stop)
+
+    monkeypatch.setattr(team_rounds, "search_neighbourhoods", search)
+    world = World(boxes=[[-0.5, -0.3, 8.5, 0.0], [-0.5, 0.7, 8.5, 1.0]], lower=(-0.5, -0.3), upper=(8.5, 1.0))
+    start = np.array([[0.2, 0.35, 0.0], [7.8, 0.35, np.pi]])
+    team = Team((model,) * 2, footprint=Box(0.5, 0.25))
+    problem = Problem(
+        team, start, start[::-1, :2], world, goal_heading=start[:, 2], margin=0.02, horizon=400, arrival="stay"
+    )
+    assert make_planner(engine="cpu").solve(problem, seed=0).verified
+    assert 0 < len(rounds) < 100
 
 
 @pytest.mark.parametrize(
