@@ -39,10 +39,10 @@ CELLS = (
     (1.0, MAX_NODES, True, 0.0),
     (0.8, MAX_NODES, True, 0.0),
     (0.6, MAX_NODES, True, 0.0),
-    (0.25, 10 * MAX_NODES, False, 0.0),
     (1.0, MAX_NODES, True, 0.125),
     (1.0, MAX_NODES, True, 0.1),
     (1.0, MAX_NODES, True, 0.08),
+    (0.25, 10 * MAX_NODES, False, 0.0),
 )
 """Sizes of cells that are tried in turn for a robot alone, as shares of the usual one; nodes; whether it stops after
 every move, which leaves more of them to a car that parks; and the sizes near to its start and its goal, if they are

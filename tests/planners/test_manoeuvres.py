@@ -67,6 +67,20 @@ def test_a_place_that_only_the_finest_cells_lead_into(model: str) -> None:
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("model", ["car_first_order", slow("car")])
+def test_a_place_that_leads_on_from_beside_the_goal_only(model: str) -> None:
+    """So near to the kerb no turn is small enough; a little farther from it the robot has arrived as well."""
+    world = World(boxes=[[0.0, 0.0, 1.55, 0.4], [2.45, 0.0, 5.0, 0.4]], lower=[0, 0], upper=[5, 2])
+    team = Team((model,), footprint=Box(0.6, 0.3))
+    start = [[1.7, 0.9, 0.4, *[0.0] * (team.state_size - 3)]]
+    solved(
+        Problem(
+            team, start, [[2.0, 0.2]], world, horizon=800, margin=0.02, goal_radius=0.04, goal_heading=0.0,
+            goal_heading_tolerance=0.05,
+        )
+    )  # fmt: skip
+
+
 def test_searches_in_the_same_nodes_have_numbers_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[int, int]] = []
 
