@@ -18,18 +18,17 @@ import numpy as np
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.goal_poses import MOST_TRAILERS
-from d4orm_env.dynamics.robot_model import ACCELERATION, OWN_LIMITS, SPEED, TURN_RATE
+from d4orm_env.dynamics.robot_model import ACCELERATION, OWN_LIMITS, TURN_RATE
 from d4orm_env.dynamics.unicycle2 import MAX_TURN_ACCELERATION
 from d4orm_planners.manoeuvres.first_order_car_moves import first_order_car_moves
 from d4orm_planners.manoeuvres.kinds import LENGTHS, MAX_STEPS, OPS, Kind, Mode, Move, held
+from d4orm_planners.manoeuvres.sideways_moves import holonomic2d_jerk_moves, holonomic2d_moves, velocity2d_moves
 
 POSE_SIZE = 3 + MOST_TRAILERS
 """Numbers of a pose: position, heading and hitch angles, zero for those that there are not."""
 TURNS = (1, 2)
 """Sectors by which an arc turns, to either side."""
 TURNS_ON_THE_SPOT = (1, 4)
-DIRECTIONS = 8
-"""Directions of a robot without a heading."""
 
 
 class Primitives(NamedTuple):
@@ -246,47 +245,15 @@ def _car(kind: Kind) -> Iterator[Move]:
         yield from _paced(kind, way, kind.pace(way), wheel)
 
 
-def _compass() -> Iterator[tuple[float, float]]:
-    for number in range(DIRECTIONS):
-        sine, cosine = portable.sin_cos(np.float64(number * 2 * np.pi / DIRECTIONS))
-        yield float(cosine), float(sine)
-
-
-def _velocity2d(kind: Kind) -> Iterator[Move]:
-    most = kind.limits[SPEED]
-    for (x, y), length in product(_compass(), LENGTHS):
-        yield (), (), held(kind.steps(length * kind.cell, most), most * x, most * y)
-
-
-def _holonomic2d(kind: Kind) -> Iterator[Move]:
-    most, ways, rest = kind.limits[SPEED], list(_compass()), (0.0, 0.0)
-    for number, (x, y) in enumerate(ways):
-        going, count = (most * x, most * y), kind.speeding_up(most)
-        push = most / (count * kind.dt)
-        yield rest, going, held(count, push * x, push * y)
-        yield going, rest, held(count, -push * x, -push * y)
-        for side in (1, -1):
-            other = ways[(number + side) % DIRECTIONS]
-            gap = (other[0] - x, other[1] - y)
-            count = kind.speeding_up(most * sqrt(gap[0] ** 2 + gap[1] ** 2))
-            push = most / (count * kind.dt)
-            yield going, (most * other[0], most * other[1]), held(count, push * gap[0], push * gap[1])
-        for length in LENGTHS:
-            yield going, going, held(kind.steps(length * kind.cell, most), 0.0, 0.0)
-        count, peak = kind.hop(LENGTHS[0] * kind.cell, kind.limits[ACCELERATION])
-        if peak <= most:
-            push = peak / (count * kind.dt)
-            yield rest, rest, np.concatenate([held(count, push * x, push * y), held(count, -push * x, -push * y)])
-
-
 MOVES: dict[str, Callable[[Kind], Iterator[Move]]] = {
     "unicycle": _unicycle,
     "unicycle1": _unicycle,
     "unicycle2": _unicycle2,
     "differential_drive": _differential_drive,
     "car": _car,
-    "velocity2d": _velocity2d,
-    "holonomic2d": _holonomic2d,
+    "velocity2d": velocity2d_moves,
+    "holonomic2d": holonomic2d_moves,
+    "holonomic2d_jerk": holonomic2d_jerk_moves,
     "car_with_1_trailer": first_order_car_moves,
     "car_with_2_trailers": first_order_car_moves,
     "car_with_3_trailers": first_order_car_moves,

@@ -12,6 +12,7 @@ from d4orm_env.core.gaps import nearest, world_gap
 from d4orm_env.core.goal_poses import states_at_goals
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.dynamics.holonomic2d_jerk import HOLONOMIC2D_JERK
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE, Model
 from d4orm_env.dynamics.unicycle2 import MAX_TURN_ACCELERATION, UNICYCLE2
 from d4orm_planners.manoeuvres.costs import Area, Costs, costs_of
@@ -184,9 +185,11 @@ def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:
 def _limits(kind: Kind) -> Limits:
     model, own, lower = kind.model, kind.limits, kind.lower
     way = TURNING if model.turns_in_place else CURVING if model.first_order else NOWHERE
+    if model.heading_index is None:
+        way = NOWHERE if model.name == HOLONOMIC2D_JERK.name else SIDEWAYS
     swing = own[MAX_TURN_ACCELERATION] if model.name == UNICYCLE2.name else np.inf
     return Limits(
-        SIDEWAYS if model.heading_index is None else way, own[SPEED], lower[SPEED],
+        way, own[SPEED], lower[SPEED],
         np.inf if model.first_order else own[ACCELERATION], own[TURN_RATE], lower[TURN_RATE], swing,
         float(np.float32(kind.dt)),
     )  # fmt: skip

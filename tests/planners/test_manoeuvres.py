@@ -154,6 +154,13 @@ def test_second_order_unicycles_turn_on_without_stopping() -> None:
     assert plan.metrics["makespan"] < 16
 
 
+def test_robots_with_a_limited_jerk_are_planned_with_others() -> None:
+    world = World(boxes=[[1.9, 1.9, 2.1, 2.1]], lower=(0, 0), upper=(4, 4))
+    team = Team(("holonomic2d_jerk", "unicycle"), footprint=Box(0.5, 0.25))
+    start = np.array([[1, 1, 0], [3, 3, 0]])
+    solved(Problem(team, np.pad(start, ((0, 0), (0, 3))), start[::-1, :2], world, goal_heading=[np.nan, 1.0]))
+
+
 def test_moves_longer_than_a_search_has_room_for_are_left_out() -> None:
     """A robot that reverses by a hair's breadth in a step would take millions of them."""
     usual = kind_of("unicycle1")
