@@ -19,7 +19,7 @@ from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.measured_states import OLDEST, brought_up, completed, seconds
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
 from d4orm_planners.base.policy import Actions, Observations, OpenLoop, Policy, robot_indices
-from d4orm_planners.base.policy_threads import Background, check_episode
+from d4orm_planners.base.policy_threads import Background, TimeLimit, check_episode, keep_collections_short
 from d4orm_planners.tracking.reference_feedback import (
     ActuatorLag,
     ControlSetpoint,
@@ -32,7 +32,7 @@ from d4orm_planners.tracking.steering import advanced, limited_states, present_v
 Mode = Literal["nominal", "measured"]
 SAME_PERIOD = 0.5  #: Share of a period within which another call gets the same setpoint
 LATE = 0.25  #: Share of a period by which a late step's successors may come earlier than a period after it
-IN_TIME = 0.9  #: Share of a step's timeout that is a policy's deadline
+IN_TIME = 0.8  #: Share of a step's timeout that is a policy's deadline
 
 
 class Controller:
@@ -57,8 +57,9 @@ class Controller:
             missed by, that the reference leaves to the feedback, in mode ``"nominal"`` or with a tracker. By default
             0.5 with a tracker, which has its robot tilt or turn before it can push, 0.2 in mode ``"nominal"`` without,
             else none.
-        timeout: Longest time that a step waits for the policy [s], ``None`` for any; robots brake meanwhile, and a late
-            answer is not used. A named policy with a ``deadline``, as D4orm-C2F, gets nine tenths of it.
+        timeout: Longest time that a step takes [s], ``None`` for any. The policy is waited for as long as what comes
+            after fits in; then robots brake, and its late answer is not used. A named policy with a ``deadline``, as
+            D4orm-C2F, gets four fifths of it.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
             setpoints come later by the largest: with it robots can drive as the reference does. In mode ``"measured"``
             the policy sees robots as they would be without it. By default it is the team's; of a team without one it is
@@ -100,6 +101,7 @@ class Controller:
         self._given_lag = lag if lag is None else check_lag(lag)
         self._leads = self.tracker or not self._looks
         self._background: Background[Actions] = Background()
+        self._limit = TimeLimit()
         self._env: Any = None
         self._observer: DisturbanceObserver
         self._time, self._lead, self.clock_resets = np.inf, np.zeros(0), 0
@@ -160,6 +162,8 @@ class Controller:
         self._time, self._lagged = time - problem.dt, LaggedReference(problem, start, own)
         idle = self._joint.controls
         self._setpoint = self._described(Reference(start, start, idle, idle), held=False)
+        if self.timeout is not None:
+            keep_collections_short()
 
     def step(self, states: ArrayLike, time: float, age: ArrayLike = 0.0) -> ControlSetpoint:
         """Return the setpoint for the period that begins now.
@@ -176,6 +180,7 @@ class Controller:
             RuntimeError: Before :meth:`begin`.
             ValueError: If the states have another shape, the time is no number of seconds, or one is too old.
         """
+        self._limit.begin(self.timeout)
         reference, dt = self._joint.states, self.problem.dt
         measured, known = completed(self.problem, self._bounds, states, reference, self._expected)
         measured = brought_up(self._robots, measured, known, self._driven, age)
@@ -186,6 +191,7 @@ class Controller:
             self._time = float(time) if passed < 0 else max(self._time + dt, float(time) - LATE * dt)
             self.clock_resets += passed < 0
             self._driven.append(self._observer.driven)
+            self._limit.end()
         return self._setpoint
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
@@ -281,7 +287,7 @@ class Controller:
             return None
         check_episode(self.policy, self._env)
         acting = {agent: self._observations[agent] for agent in self._env.agents}
-        return self._background.run(partial(self.policy.act, acting, self._env.state()), self.timeout)
+        return self._limit.run(self._background, partial(self.policy.act, acting, self._env.state()))
 
     def _described(self, reference: Reference, held: bool) -> ControlSetpoint:
         """Return the setpoint of a reference, whose controls are those of the robots."""

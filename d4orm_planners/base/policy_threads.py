@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import threading
@@ -12,10 +13,21 @@ from contextlib import contextmanager
 from functools import wraps
 from typing import Any, Generic, TypeVar
 
+import numpy as np
+
 from d4orm_env.engine.threads import keep_to_one_core
 
 Result = TypeVar("Result")
 ATTRIBUTE = "_driving"  #: Attribute of a policy's :class:`Driving`, which its copies do not share
+SWITCH = 5e-4
+"""Time for which a thread keeps the interpreter that another one waits for [s], a tenth of Python's own: control loops
+wait for it after each of their many kernels, at worst every time."""
+LEAST, MOST, KEPT = 0.1, 0.5, 0.9
+"""Shares of a time limit that are kept back for what comes after a wait, at least and at most, and share of the longest
+time that this took lately which a call keeps."""
+MANY = 20_000
+"""Objects that a garbage collection beside control loops may look at. A process with kernels has 300,000, for which it
+holds up all threads for a tenth of a second."""
 _REMEDY = "make a policy for every thread, with make_policy() or copy.copy()"
 
 
@@ -103,6 +115,8 @@ class Background(Generic[Result]):
 
     def start(self, work: Callable[[], Result]) -> Future[Result]:
         if self._pool is None:
+            # Of the whole process, there is no other.
+            sys.setswitchinterval(min(SWITCH, sys.getswitchinterval()))
             self._pool = ThreadPoolExecutor(1, thread_name_prefix="background", initializer=self._initializer)
         self._job = self._pool.submit(work)
         return self._job
@@ -145,6 +159,43 @@ class Background(Generic[Result]):
         pool, self._pool = self._pool, None
         if pool is not None:
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+class TimeLimit:
+    """Limit of the time that each of somebody's calls takes, part of which it waits for work in the background."""
+
+    def __init__(self) -> None:
+        self._begin, self._seconds, self._waited, self._rest = 0.0, np.inf, np.inf, 0.0
+
+    def begin(self, seconds: float | None) -> None:
+        """Note that a call begins, which may take so many seconds, or any time."""
+        self._begin, self._seconds, self._waited = time.perf_counter(), np.inf if seconds is None else seconds, np.inf
+
+    @property
+    def left(self) -> float | None:
+        """Seconds that the call may wait, so that what comes after it fits in; ``None`` for any."""
+        if self._seconds == np.inf:
+            return None
+        rest = min(max(self._rest, LEAST * self._seconds), MOST * self._seconds)
+        return self._begin + self._seconds - rest - time.perf_counter()
+
+    def run(self, background: Background[Result], work: Callable[[], Result]) -> Result | None:
+        """The result of the work, or ``None`` if it is late."""
+        result = background.run(work, self.left)
+        self._waited = time.perf_counter()
+        return result
+
+    def end(self) -> None:
+        """Note that the call ends."""
+        self._rest = max(time.perf_counter() - self._waited, KEPT * self._rest)
+
+
+def keep_collections_short() -> None:
+    """Have garbage collections look at what is new only, from now on, where there is much else."""
+    if gc.isenabled() and len(gc.get_objects(generation=2)) > MANY:
+        gc.unfreeze()
+        gc.collect()
+        gc.freeze()
 
 
 def _yield_to_others() -> None:

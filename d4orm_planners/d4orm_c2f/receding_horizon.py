@@ -16,7 +16,7 @@ from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.planner_registry import find_policy
 from d4orm_planners.base.policy import StatePolicy
-from d4orm_planners.base.policy_threads import Background
+from d4orm_planners.base.policy_threads import Background, TimeLimit
 from d4orm_planners.base.settings import CheckedSettings
 from d4orm_planners.d4orm_c2f.barrier import prepare_barriers, safe_velocities
 from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlan, CoarseWaypoints
@@ -63,6 +63,7 @@ class D4ormC2F(StatePolicy):
         self._refinement: Background[CoarsePlan] = Background(yielding=True)
         self._replanning: Background[CoarsePlan] = Background(yielding=True)
         self._control: Background[Prediction] = Background()
+        self._limit = TimeLimit()
 
     @property
     def missed(self) -> int:
@@ -104,6 +105,7 @@ class D4ormC2F(StatePolicy):
         self.coarse_time = time.perf_counter() - begin  #: Time that the first coarse plan took [s]
 
     def _controls(self, joint: JointState) -> FloatArray:
+        self._limit.begin(self.config.deadline)
         goals = joint.goals
         joint = self._deviation.observe(joint)
         self._note_arrivals(joint)
@@ -122,7 +124,9 @@ class D4ormC2F(StatePolicy):
         if self.config.control_noise_std:
             noise = self._random.normal(0, self.config.control_noise_std, controls.shape)
             controls = np.clip(controls + noise, *self.problem.team.control_bounds).astype(np.float32)
-        return self._deviation.send(controls)
+        controls = self._deviation.send(controls)
+        self._limit.end()
+        return controls
 
     def _evading(self, joint: JointState, controls: FloatArray) -> FloatArray:
         """The controls ``(K, m)``, changed for robots that might come to touch something: these brake, or evade."""
@@ -187,10 +191,9 @@ class D4ormC2F(StatePolicy):
         seed = derived_seed(self._seed, Stream.CONTROL_LOOP, joint.steps)
         stuck = tracker.stuck & ~arrived
         careful = tracker.followed(joint, len(base)) if stuck.any() else None
-        inflation, limit = self._deviation.margin_inflation(self.config.reaction_time), self.config.deadline
+        inflation = self._deviation.margin_inflation(self.config.reaction_time)
         now = Situation(joint, arrived, subgoals, base, left, careful, stuck, inflation)
-        seconds = None if limit is None else limit - (time.perf_counter() - begin)
-        result = self._control.run(partial(self._window.predict, now, seed, seconds), seconds)
+        result = self._limit.run(self._control, partial(self._window.predict, now, seed, self._limit.left))
         margin, num_steps = float("nan"), 0
         if result is not None:
             self._plan, self._next, self.predicted, margin, num_steps = result.controls, 0, *result[1:]

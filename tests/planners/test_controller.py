@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import threading
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from d4orm_env import Problem, Team, make_problem, navigation_v0, rollout
 from d4orm_env.disturbances import Bias, ControlNoise, Gain, Lag, StateNoise
 from d4orm_env.envs.joint_state import split_state
 from d4orm_planners import Controller, make_planner, make_policy, run_episode
+from d4orm_planners.base import policy_threads
 from d4orm_planners.base.disturbance_observer import MOST, DisturbanceObserver
 from d4orm_planners.base.policy import GoToGoal, OpenLoop
 from d4orm_planners.tracking.reference_feedback import ControlSetpoint
@@ -402,6 +405,41 @@ def test_who_does_not_answer_in_time_is_not_waited_for(model: str) -> None:
         slow.allowed.set()
         times = itertools.count(24)
         until(lambda: not controller.step(problem.start, next(times) * problem.dt).held)
+
+
+def test_what_a_step_does_after_its_wait_is_within_the_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock on which a policy never answers, and a setpoint takes a fifth of the time."""
+    clock, described, taken, problem = [0.0], Controller._described, [], team("holonomic2d", 2)
+
+    def late(background: Any, work: Any, timeout: float) -> None:
+        clock[0] += timeout
+
+    def slow(*arguments: Any, **named: Any) -> ControlSetpoint:
+        clock[0] += 0.2
+        return described(*arguments, **named)
+
+    monkeypatch.setattr(policy_threads, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(policy_threads.Background, "run", late)
+    monkeypatch.setattr(Controller, "_described", slow)
+    controller = Controller("go-to-goal", timeout=1.0)
+    controller.begin(problem, problem.start)
+    for step in range(5):
+        clock[0] = 10.0 * step
+        assert controller.step(problem.start, step * problem.dt).held
+        taken.append(clock[0] - 10.0 * step)
+    np.testing.assert_allclose(taken[1:], 1.0)
+
+
+def test_beside_control_loops_garbage_is_looked_for_among_what_is_new() -> None:
+    kept, problem = [[[]] for _ in range(policy_threads.MANY)], team("holonomic2d", 2)
+    gc.collect()
+    assert len(gc.get_objects(generation=2)) > policy_threads.MANY
+    for timeout, few in ((None, False), (60.0, True)):
+        controller = Controller("go-to-goal", timeout=timeout)
+        controller.begin(problem, problem.start)
+        assert (len(gc.get_objects(generation=2)) < policy_threads.MANY) == few
+    gc.unfreeze()
+    del kept
 
 
 def until(condition: Any) -> None:

@@ -27,7 +27,7 @@ from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
 from d4orm_planners.base import candidate
 from d4orm_planners.base.episode import open_env
-from d4orm_planners.base.policy_threads import Background
+from d4orm_planners.base.policy_threads import SWITCH, Background
 from d4orm_planners.d4orm_c2f import fine_plan
 from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlanning, coarse_problem
 from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
@@ -402,6 +402,17 @@ def test_a_job_in_the_background_is_one_at_a_time_and_gives_its_result_once() ->
     background._job.result()  # type: ignore[union-attr]
     assert background.result() == (True, True)
     assert background.result() == (True, None)
+
+
+def test_threads_let_the_interpreter_go_soon_beside_a_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[float] = []
+    monkeypatch.setattr(sys, "setswitchinterval", asked.append)
+    for interval in (0.005, 1e-4):
+        monkeypatch.setattr(sys, "getswitchinterval", lambda interval=interval: interval)
+        background = Background[None]()
+        background.start(lambda: None)
+        background.forget()
+    assert asked == [SWITCH, 1e-4]
 
 
 def test_an_error_of_late_work_is_raised_once() -> None:
