@@ -63,7 +63,7 @@ class DisturbanceObserver:
 
     def __init__(self, problem: Problem, lag: ArrayLike | None = 0.0) -> None:
         self.problem, count, d = problem, problem.num_robots, problem.dimension
-        self._summed = _summed_controls(problem)
+        self._summed = summed_controls(problem)
         self._finder = LagFinder(problem, self._summed) if lag is None else None
         lag = 0.0 if lag is None else lag
         given: Floats = np.asarray(check_lag(lag), np.float64)
@@ -164,7 +164,7 @@ class LagFinder:
     robots did follows best by a straight line, so that neither a steady push nor weak actuators make a difference.
 
     Robots whose controls do not sum up to a state are taken to have none; ``summed`` ``(K, n, m)`` is
-    :func:`_summed_controls`.
+    :func:`summed_controls`.
     """
 
     def __init__(self, problem: Problem, summed: FloatArray) -> None:
@@ -215,7 +215,7 @@ class LagFinder:
         return bool(better.any())
 
 
-def _summed_controls(problem: Problem) -> FloatArray:
+def summed_controls(problem: Problem) -> FloatArray:
     """``(K, n, m)`` one where a state other than a position or heading is the sum of a control over time, else zero."""
     rest, still = np.zeros_like(problem.start), np.zeros((problem.num_robots, problem.control_size), np.float32)
     summed = np.zeros((*rest.shape, problem.control_size), np.float32)

@@ -189,6 +189,7 @@ FIELDS = (
     "controller",
     "robots",
     "deadline",
+    "watchdog",
     "domain",
     "seed",
     "zenoh",
@@ -207,6 +208,7 @@ class ServeTask:
     controller: Controller
     names: tuple[str, ...]
     deadline: float
+    watchdog: float | None
     domain: int
     seed: int
     zenoh: ZenohSettings
@@ -219,7 +221,8 @@ def serve(config: Annotated[Path, Option("--config", "-c", help="YAML file that 
     task, over = read_task(config, FIELDS[:1], FIELDS[1:], _serve_task), threading.Event()
     # Robots are told to stand once it is set.
     with on_signals(lambda *_: over.set()), RosSession(task.zenoh, task.domain, NODE, task.wire) as session:
-        server = FleetServer(session, task.problem, task.controller, task.names, task.deadline, task.seed, task.stamps)
+        how = task.deadline, task.seed, task.stamps, task.watchdog
+        server = FleetServer(session, task.problem, task.controller, task.names, *how)
         typer.echo(f"serving {', '.join(task.names)} on domain {task.domain}; Ctrl-C ends it")
         server.run(over)
 
@@ -249,6 +252,7 @@ def _serve_task(fields: Mapping[str, Any], folder: Path) -> ServeTask:
         controller=Controller(policy, **own, **settings),
         names=tuple(names),
         deadline=fields.get("deadline", 0.5),
+        watchdog=fields.get("watchdog"),
         domain=whole_number(fields.get("domain", 0), "domain", 0, 232),
         seed=whole_number(fields.get("seed", 0), "seed", 0),
         zenoh=ZenohSettings.of(zenoh),

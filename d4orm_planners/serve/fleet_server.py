@@ -14,8 +14,10 @@ from d4orm_env.core.problem import Problem
 from d4orm_planners.base.controller import Controller
 from d4orm_planners.base.measured_states import OLDEST
 from d4orm_planners.serve import wire
+from d4orm_planners.serve.commands import Commands
+from d4orm_planners.serve.running_on import RunningOn, slowed
+from d4orm_planners.serve.wanted_goals import WantedGoals
 from d4orm_planners.serve.wire import FleetRobot, RosSession, Subscriber, position_of, turned
-from d4orm_planners.tracking import ros_messages as ros
 from d4orm_planners.tracking.reference_feedback import ControlSetpoint
 from d4orm_planners.tracking.steering import braking_share
 
@@ -56,7 +58,9 @@ class FleetServer:
         deadline: Longest silence of a robot [s].
         seed: Of the controller.
         stamped: Whether robots' clocks are this machine's: states are as old as their stamps say then, and those older
-            than the deadline are not taken. Else they are of the moment in which they are read.
+            than the deadline, or from as far ahead, are not taken. Else they are of the moment in which they are read.
+        watchdog: Silence after which each robot stops by itself [s]. All are slowed down where they would come near to
+            anything if they heard nothing more; where that is not known, nothing is looked at.
     """
 
     def __init__(
@@ -68,6 +72,7 @@ class FleetServer:
         deadline: float = 0.5,
         seed: int = 0,
         stamped: bool = False,
+        watchdog: float | None = None,
     ) -> None:
         if len(names) != problem.num_robots:
             raise ValueError(f"there are {len(names)} names for {problem.num_robots} robots; give one for each")
@@ -75,26 +80,27 @@ class FleetServer:
             raise ValueError(f"robots are called {', '.join(names)}; give each a name of its own")
         self.deadline = positive_number(deadline, "deadline", least=problem.dt)
         self._problem, self._controller, self._seed, self._stamped = problem, controller, seed, stamped
+        self._watchdog = watchdog if watchdog is None else positive_number(watchdog, "watchdog", least=2 * problem.dt)
+        self._running_on = None if watchdog is None else RunningOn(problem, watchdog)
         self._robots = [FleetRobot(name, np.full(problem.state_size, np.nan, np.float32)) for name in names]
         self._odometry = [session.subscriber(f"{name}/odom", wire.ODOMETRY) for name in names]
         self._poses = [session.subscriber(f"{name}/pose", wire.POSE) for name in names]
         self._goals = [session.subscriber(f"{name}/goal", wire.POSE) for name in names]
-        self._wanted: dict[int, tuple[Floats, float]] = {}  # goals of robots, and when they were heard
+        self.wanted = WantedGoals(names, self.deadline)  #: Goals that robots are sent to
         self._unusable = 0
-        self._commands = [session.publisher(f"{name}/cmd_vel", wire.TWIST) for name in names]
-        self._setpoints = [session.publisher(f"{name}/setpoint", wire.TRAJECTORY) for name in names]
+        self._commands = Commands(session, problem, self._robots)
         self._diagnostics = session.publisher("diagnostics", wire.DIAGNOSTICS)
         self._planner = ThreadPoolExecutor(1, thread_name_prefix="serve")
         self._begun: Future[None] | None = None
         self._period: Period | None = None
         self._pace = self._passed = 1.0  # pace while braking, and share of the period that is over
-        self._twists: Floats = np.zeros((len(names), 4))  # as told last
-        self._emergency, self._replan, self._stops, self._stopped = False, False, 0, -np.inf
+        self._emergency, self._replan, self._stops, self._heeded, self._stopped = False, False, 0, 0, -np.inf
         self._commanding = threading.RLock()
         self._e_stop = session.subscriber("e_stop", wire.BOOL, self._mind)
         self._inputs = *self._odometry, *self._poses, *self._goals, self._e_stop
-        # What it does, when it told so, times of the last periods' work [s], and why a goal was refused last.
-        self.state, self._told, self.loops, self.refusal = WAITING, -np.inf, [0.0], ""
+        # What it does, when it told so and when it last looked, and times of the last periods' work [s].
+        self.state, self._told, self._looked, self.loops = WAITING, -np.inf, np.inf, [0.0]
+        self._clock = -np.inf  # as the controller is told
 
     def run(self, over: threading.Event) -> None:
         """Serve until ``over`` is set; robots are told to stand then."""
@@ -113,6 +119,9 @@ class FleetServer:
 
     def tick(self, now: float) -> None:
         """One period: read what has come, and command every robot."""
+        elapsed, self._looked = now - self._looked, now
+        if elapsed > (self._watchdog or self.deadline) and self.state in (DRIVING, BRAKING):
+            self._lose_all()
         self._read(now)
         before, self.state = self.state, self._next_state(now)
         if self.state == DRIVING:
@@ -120,7 +129,7 @@ class FleetServer:
             # The horizon is over, and a robot has not arrived.
             self._replan |= self._controller.over and not self._controller.arrived.all()
         elif self.state == BRAKING:
-            self._brake(now)
+            self._brake(now, max(elapsed / self._problem.dt - 1.0, 0.0))
         else:
             self._stand()
         if self.state != before or now - self._told >= TELL:
@@ -128,7 +137,8 @@ class FleetServer:
             self._diagnostics.publish(self._diagnosis(now))
 
     def _next_state(self, now: float) -> str:
-        if self._emergency or self._silent(now):
+        stops, self._heeded = self._stops - self._heeded, self._stops
+        if self._emergency or stops or self._silent(now):  # a stop counts that was called off within the period, too
             self._replan, self._stopped = True, now
             return STOPPED if self._emergency else WAITING
         if self._begun is not None and self._begun.done():
@@ -141,10 +151,15 @@ class FleetServer:
                 return BRAKING
             if self._still_stops(now):
                 return PLANNING
-            self._replan = False
+            self._replan, self._period = False, None
             states = np.stack([robot.state for robot in self._robots])
-            self._begun = self._planner.submit(self._controller.begin, self._problem, states, now, self._seed)
+            self._begun = self._planner.submit(self._begin, self._problem, states, max(now, self._clock))
         return DRIVING if self._begun is None else PLANNING
+
+    def _begin(self, problem: Problem, states: FloatArray, now: float) -> None:
+        self._controller.begin(problem, states, now, self._seed)
+        if self._running_on is not None:  # load, or compile, what it needs
+            self._running_on.meets_something(problem.start, np.zeros_like(problem.team.control_limits))
 
     def _read(self, now: float) -> None:
         for number, robot in enumerate(self._robots):
@@ -157,8 +172,9 @@ class FleetServer:
                     own = turned(robot.velocity, -wire.heading_of(message.pose.orientation))
                     self._hear(number, message.pose, now, message.header, own)
             for message in self._goals[number].take():
-                self._wanted[number] = position_of(message.pose.position)[: self._problem.dimension], now
-        self._take_goals(now)
+                self.wanted.hear(number, position_of(message.pose.position)[: self._problem.dimension], now)
+        before, self._problem = self._problem, self.wanted.taken(self._problem, now)
+        self._replan |= self._problem is not before
         self._mind(self._e_stop)
 
     def _mind(self, e_stop: Subscriber) -> None:
@@ -171,34 +187,20 @@ class FleetServer:
                     self._stand()
 
     def _hear(self, number: int, pose: Any, now: float, header: Any, velocity: Floats, rate: float = np.nan) -> None:
-        age = max(time.time() - wire.time_of(header), 0.0) if self._stamped else 0.0
+        age = time.time() - wire.time_of(header) if self._stamped else 0.0
         state, heading = wire.state_from(self._problem, number, pose, velocity, rate), wire.heading_of(pose.orientation)
-        if np.isfinite(heading) and np.isfinite(state[: self._problem.dimension]).all() and age <= self.deadline:
-            self._robots[number].take_state(state, heading, now, age)
+        if np.isfinite(heading) and np.isfinite(state[: self._problem.dimension]).all() and abs(age) <= self.deadline:
+            self._robots[number].take_state(state, heading, now, max(age, 0.0))
         else:
             self._unusable += 1
 
-    def _take_goals(self, now: float) -> None:
-        """Take the goals of the last moments together, as two robots may change places, or else one by one."""
-        self._wanted = {number: goal for number, goal in self._wanted.items() if now - goal[1] <= self.deadline}
-        if not self._take_goal(list(self._wanted)):
-            for number in list(self._wanted):
-                self._take_goal([number])
-
-    def _take_goal(self, numbers: list[int]) -> bool:
-        """Give some robots the goals that are wanted; return whether they can have them."""
-        goals = self._problem.goal.copy()
-        for number in numbers:
-            goals[number] = self._wanted[number][0]
-        if not np.array_equal(goals, self._problem.goal):
-            try:
-                self._problem, self._replan = self._problem.replace(goal=goals), True
-            except ValueError as error:
-                self.refusal = f"goal of {', '.join(self._robots[number].name for number in numbers)}: {error}"
-                return False
-        for number in numbers:
-            del self._wanted[number]
-        return True
+    def _lose_all(self) -> None:
+        """Stop, as this process has been silent itself: robots have stopped, and what has come is from before that."""
+        self._stand()
+        for topic in (*self._odometry, *self._poses):
+            topic.take()
+        for robot in self._robots:
+            robot.heard = -np.inf
 
     def _silent(self, now: float) -> list[str]:
         return [robot.name for robot in self._robots if now - robot.heard > self.deadline]
@@ -207,40 +209,60 @@ class FleetServer:
         """Return whether a robot that was stopped, maybe at full speed, is not at rest yet."""
         team = self._problem.team
         speeds = [robot.state[list(model.speed_indices)] for robot, model in zip(self._robots, team.robot_models)]
-        fast = [np.linalg.norm(np.nan_to_num(own)) for own in speeds] > AT_REST * team.max_speed
+        fast = [np.linalg.norm(np.nan_to_num(own, nan=np.inf)) for own in speeds] > AT_REST * team.max_speed
         return bool((fast & (now - self._stopped < team.max_speed / team.max_acceleration)).any())
 
-    def _next_period(self, states: FloatArray, now: float) -> Period:
+    def _next_period(self, states: FloatArray, now: float, before: Period | None) -> Period:
+        self._clock = max(now, self._clock + self._problem.dt)  # another period, whenever it is asked for
         ages = [min(now - robot.measured, OLDEST * self._problem.dt) for robot in self._robots]
-        setpoint = self._controller.step(states, now, ages)
+        setpoint = self._controller.step(states, self._clock, ages)
         lags = self._controller.lag * np.isfinite(states[:, 0])  # a reference has none
         headings = [robot.heading for robot in self._robots]
-        rows = zip(self._controller.states, setpoint.control, headings, self._twists, lags)
+        rows = zip(self._controller.states, setpoint.control, headings, self._commands.told, lags)
         twists = [wire.twist(self._problem, number, *row) for number, row in enumerate(rows)]
-        begin = setpoint if self._period is None else self._period.setpoint
+        begin = setpoint if before is None else before.setpoint
         return Period(begin.position, setpoint, np.array(twists))
 
     def _drive(self, now: float) -> None:
         missing = [now - robot.heard > 2 * self._problem.dt for robot in self._robots]  # for the last two periods
         states = np.where(np.array(missing)[:, None], np.float32(np.nan), [robot.state for robot in self._robots])
-        stops, period = self._stops, self._next_period(states, now)
-        _, setpoint, twists = period
+        stops, period = self._stops, self._next_period(states, now, self._period)
+        begin, setpoint, twists = period
+        pace = self._safe_paces(period)
+        position, velocity = begin + pace * (setpoint.position - begin), pace * setpoint.velocity
+        acceleration = setpoint.acceleration + (pace - 1) / self._problem.dt * setpoint.velocity
         with self._commanding:
             if self._emergency or self._stops != stops:  # it came while these were thought out
                 return
             self._period, self._pace, self._passed = period, 1.0, 1.0
             for robot in self._robots:
                 robot.stand = None
-            self._command(period, twists, setpoint.position, setpoint.velocity, setpoint.acceleration)
+            self._commands.move(setpoint.heading, pace * twists, position, velocity, acceleration)
 
-    def _brake(self, now: float) -> None:
-        """Slow all robots down on the controller's reference, by the same share."""
+    def _safe_paces(self, period: Period) -> Floats:
+        """``(K, 1)`` paces of a period: lower where robots that heard nothing more would come near to things."""
+        _, setpoint, twists = period
+        ahead = self._running_on
+        if ahead is None or not ahead.meets_something(self._controller.states, setpoint.control):
+            return np.ones((len(twists), 1))
+        return slowed(
+            twists, self._commands.told, braking_share(self._problem, setpoint.velocity, setpoint.acceleration)
+        )
+
+    def _brake(self, now: float, late: float) -> None:
+        """Slow all robots down on the controller's reference, by the same share.
+
+        They have gone on for so many periods too ``late``.
+        """
         period, before, dt, stops = self._period, self._pace, self._problem.dt, self._stops
         assert period is not None  # braking comes after driving
+        blind, passed = np.full_like(self._controller.states, np.nan), self._passed + before * late
+        while passed > 1.0:
+            period, passed = self._next_period(blind, now, period), passed - 1.0
         pace = max(before - braking_share(self._problem, period.setpoint.velocity, period.setpoint.acceleration), 0.0)
-        twists, passed = min(pace, 1.0 - self._passed) * period.twists, self._passed + pace
+        twists, passed = min(pace, 1.0 - passed) * period.twists, passed + pace
         if passed >= 1.0:
-            period, passed = self._next_period(np.full_like(self._controller.states, np.nan), now), passed - 1.0
+            period, passed = self._next_period(blind, now, period), passed - 1.0
             twists = twists + passed * period.twists
         setpoint = period.setpoint
         position = period.begin + passed * (setpoint.position - period.begin)
@@ -251,33 +273,11 @@ class FleetServer:
             self._period, self._pace, self._passed = period, pace, passed
             for robot, stand in zip(self._robots, position):
                 robot.stand = stand
-            self._command(period, twists, position, pace * setpoint.velocity, acceleration)
-
-    def _command(self, period: Period, twists: Floats, *points: Floats) -> None:
-        """Publish twists ``(K, 4)``, and positions, velocities and accelerations ``(K, d)`` with the headings."""
-        self._twists = twists
-        rows = zip(self._robots, twists, *points, self._facing(period.setpoint.heading))
-        for number, (robot, twist, *point) in enumerate(rows):
-            self._commands[number].publish(ros.twist(twist[:3], float(twist[3])))
-            self._setpoints[number].publish(wire.full_state(robot.name, *point))
-
-    def _facing(self, headings: Floats) -> list[float]:
-        """Headings of robots whose model has one, and the yaw of the others."""
-        models = zip(self._problem.team.robot_models, headings, self._robots)
-        return [robot.yaw if model.heading_index is None else float(own) for model, own, robot in models]
+            self._commands.move(setpoint.heading, twists, position, pace * setpoint.velocity, acceleration)
 
     def _stand(self) -> None:
-        """Hold all robots where they were when they were stopped."""
-        still, d = np.zeros(self._problem.dimension), self._problem.dimension
-        facing = self._facing(np.array([robot.heading for robot in self._robots]))
         with self._commanding:
-            self._twists = np.zeros_like(self._twists)
-            for robot, command, setpoint, heading in zip(self._robots, self._commands, self._setpoints, facing):
-                command.publish(ros.twist(np.zeros(3)))
-                if robot.stand is None and np.isfinite(robot.heard):
-                    robot.stand = robot.state[:d].astype(np.float64)
-                if robot.stand is not None:
-                    setpoint.publish(wire.full_state(robot.name, robot.stand, still, still, heading))
+            self._commands.stand()
 
     def _diagnosis(self, now: float) -> Any:
         silent, refused = self._silent(now), self._unusable + sum(topic.refused for topic in self._inputs)
@@ -287,6 +287,6 @@ class FleetServer:
             "longest loop [ms]": f"{1000 * max(self.loops):.1f}",
             "unreadable messages": str(refused),
             "clocks set": ", ".join(robot.name for robot in self._robots if robot.clock_resets),
-            "refused": self.refusal,
+            "refused": self.wanted.refusal,
         }
         return wire.diagnostics(NODE, LEVELS[self.state], self.state, values)

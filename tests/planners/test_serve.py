@@ -81,7 +81,8 @@ class Fleet:
         self.velocity, self.on = np.zeros_like(start), [True] * len(start)
         self.heard, self.diagnosis, self.setpoints = [0.0] * len(start), [""], [None] * len(start)
         self.poses, self.loss, self.random, self.moved_at = poses, loss, np.random.default_rng(0), 0.0
-        self.watchdog = watchdog
+        self.watchdog, self.moved, self._moving = watchdog, time.monotonic(), threading.RLock()
+        self.told_to_stand = [0.0] * len(start)  # when the server did so, by its stamps; infinite for who is to move
         self._over, self._subscribers = threading.Event(), [
             self.session.declare_subscriber(key("*/cmd_vel", "geometry_msgs/msg/Twist"), self._command),
             self.session.declare_subscriber(
@@ -108,13 +109,23 @@ class Fleet:
 
     def _command(self, sample: Any) -> None:
         number, sequence = int(str(sample.key_expr).split("/")[1][-1]), sample.attachment.to_bytes()
-        count, _, size, _ = struct.unpack("<qqB16s", sequence)
+        count, stamp, size, _ = struct.unpack("<qqB16s", sequence)
         assert (size, count > 0) == (16, True)
         command = STORE.deserialize_cdr(sample.payload.to_bytes(), "geometry_msgs/msg/Twist")
         cos, sin = math.cos(self.heading[number]), math.sin(self.heading[number])
         x, y = command.linear.x, command.linear.y
+        self.told_to_stand[number] = math.inf if x or y else min(self.told_to_stand[number], 1e-9 * stamp)
         if self.random.random() >= self.loss:
-            self.velocity[number], self.heard[number] = (cos * x - sin * y, sin * x + cos * y), time.monotonic()
+            with self._moving:
+                self._move()
+                self.velocity[number], self.heard[number] = (cos * x - sin * y, sin * x + cos * y), time.monotonic()
+
+    def _move(self) -> None:
+        """Robots have moved on up to now, however late this is done, or until their watchdogs stopped them."""
+        with self._moving:
+            now, stop = time.monotonic(), np.array(self.heard) + self.watchdog
+            self.position += np.clip(stop - self.moved, 0, now - self.moved)[:, None] * self.velocity
+            self.velocity[now > stop], self.moved = 0, now
 
     def _setpoint(self, sample: Any) -> None:
         message = STORE.deserialize_cdr(sample.payload.to_bytes(), "trajectory_msgs/msg/MultiDOFJointTrajectory")
@@ -127,8 +138,7 @@ class Fleet:
     def _live(self) -> None:
         odometry, stamped = odometry_of(np.zeros(2)), pose_stamped()
         while not self._over.wait(DT / 5):
-            self.velocity[time.monotonic() - np.array(self.heard) > self.watchdog] = 0
-            self.position += DT / 5 * self.velocity
+            self._move()
             if (np.abs(self.velocity) > 1e-6).any():
                 self.moved_at = time.monotonic()
             for robot in np.flatnonzero(self.on).tolist():
@@ -194,7 +204,7 @@ def test_robots_arrive_though_messages_are_lost_and_get_new_goals(endpoint: str,
             fleet.goal(0, [0.3, 0.2])
             fleet.goal(1, [math.nan, 0])
             until(lambda: bool(np.linalg.norm(fleet.position[0] - [0.3, 0.2]) < 0.1))
-            assert "goal of robot_1" in server.refusal
+            assert "goal of robot_1" in server.wanted.refusal
             point = fleet.setpoints[1]
             assert point.transforms[0].translation.x == pytest.approx(fleet.position[1, 0], abs=0.1)
             assert {"driving", "planning"} <= set(fleet.diagnosis)
@@ -263,12 +273,13 @@ def test_stamps_tell_how_old_states_are_where_clocks_are_one(monkeypatch: pytest
         def tick(old: float = 0.2) -> None:
             for name, state in zip(names, problem().start, strict=True):
                 odometry = odometry_of(state[:2])
-                odometry.header.stamp.sec, odometry.header.stamp.nanosec = 999, round(1e9 * (1 - old))
+                odometry.header.stamp.sec, odometry.header.stamp.nanosec = divmod(round(1e9 * (1000 - old)), 10**9)
                 session.say(f"{name}/odom", odometry)
             server.tick(time.monotonic())
 
-        tick(DEADLINE + 0.01)
-        assert server.state == "waiting"
+        for age in (DEADLINE + 0.01, -DEADLINE - 0.01):
+            tick(age)
+            assert server.state == "waiting"
         planned(tick, server)
     np.testing.assert_allclose(ages[-1], 0.2, atol=1e-6)
 
@@ -356,11 +367,11 @@ def test_an_emergency_stop_does_not_wait_for_the_controller() -> None:
 
 @contextlib.contextmanager
 def in_memory(
-    team_problem: Problem, mode: Mode = "measured", policy: str = "go-to-goal", lag: float = 0.0
+    team_problem: Problem, mode: Mode = "measured", policy: str = "go-to-goal", lag: float = 0.0, **settings: Any
 ) -> Iterator[tuple[Memory, FleetServer]]:
     session, names = Memory(), [f"robot_{number}" for number in range(team_problem.num_robots)]
     with Controller(policy, mode=mode, lag=lag) as controller:
-        yield session, FleetServer(session, team_problem, controller, tuple(names), DEADLINE)  # type: ignore[arg-type]
+        yield session, FleetServer(session, team_problem, controller, tuple(names), DEADLINE, **settings)  # type: ignore[arg-type]
 
 
 class RollingFleet:
@@ -374,21 +385,27 @@ class RollingFleet:
 
     def tick(self) -> None:
         self.period += 1
+        self.report()
+        self.server.tick(self.dt * self.period)
+
+    def report(self) -> None:
         for number, (pose, told) in enumerate(zip(self.poses, self.commands, strict=True)):
             turn_rate = told[-1].angular.z if told else 0.0
             odometry = odometry_of(pose[:2], ros.twist(np.array([self.speeds[number], 0, 0]), turn_rate))
             half = pose[2] / 2
             odometry.pose.pose.orientation.z, odometry.pose.pose.orientation.w = np.sin(half), np.cos(half)
             self.session.say(f"robot_{number}/odom", odometry)
-        self.server.tick(self.dt * self.period)
 
     def drive(self) -> None:
         """A period on the last commands, and the next."""
+        self.run_on()
+        self.tick()
+
+    def run_on(self) -> None:
         for number, (pose, (*_, told)) in enumerate(zip(self.poses, self.commands, strict=True)):
             self.speeds[number] += self.follows * (told.linear.x - self.speeds[number])
             speed, middle = self.speeds[number], pose[2] + told.angular.z * self.dt / 2
             pose += self.dt * np.array([speed * np.cos(middle), speed * np.sin(middle), told.angular.z])
-        self.tick()
 
 
 @pytest.mark.parametrize("mode", ["nominal", "measured"])
@@ -435,6 +452,114 @@ def test_robots_that_brake_for_new_goals_stay_on_their_ways() -> None:
     assert min(gaps) > 0
 
 
+def facing(goal: float) -> Problem:
+    """Two robots on wheels that drive at each other, to goals so far from the middle between them [m]."""
+    team = Team(("differential_drive",) * 2, radius=0.1, max_acceleration=2.0)
+    start = [[-1.5, 0, 0, 0], [1.5, 0, math.pi, 0]]
+    return Problem(team, start, [[-goal, 0], [goal, 0]], dt=DT, horizon=200, goal_radius=0.06)
+
+
+def test_robots_that_brake_are_led_on_from_where_they_are_when_the_loop_is_late() -> None:
+    with in_memory(facing(0.3)) as (session, server):
+        fleet = RollingFleet(session, server, facing(0.3))
+        planned(fleet.tick, server)
+        for _ in range(14):
+            fleet.drive()
+        session.say("robot_0/goal", pose_stamped(-0.4, 0.0))
+        fleet.drive()
+        for _ in range(3):
+            fleet.run_on()
+            fleet.period += 1
+        assert abs(fleet.speeds).min() > 0.5
+        while server.state == "braking":
+            fleet.drive()
+            point = session.sent["robot_0/setpoint"][-1].points[0].transforms[0].translation
+            assert fleet.poses[0, 0] - 1e-3 < point.x < fleet.poses[0, 0] + DT
+        assert point.x == pytest.approx(fleet.poses[0, 0], abs=5e-3)
+
+
+@pytest.mark.parametrize("watchdog", [None, 0.2])
+def test_robots_that_hear_nothing_more_do_not_meet_before_their_watchdogs_stop_them(watchdog: float | None) -> None:
+    with in_memory(facing(0.13), watchdog=watchdog) as (session, server):
+        fleet, gaps = RollingFleet(session, server, facing(0.13)), []
+        planned(fleet.tick, server)
+        for _ in range(100):
+            fleet.drive()
+            told = np.array([command[-1].linear.x for command in fleet.commands])
+            gaps.append(fleet.poses[1, 0] - fleet.poses[0, 0] - 0.2 * told.sum() - 0.2)
+    assert (min(gaps) > 0) == (watchdog is not None)
+    np.testing.assert_allclose(fleet.poses[:, 0], [-0.13, 0.13], atol=0.061)
+
+
+def test_a_loop_that_was_silent_itself_begins_anew_from_what_it_hears_after_that() -> None:
+    with in_memory(facing(0.3), watchdog=0.2) as (session, server):
+        fleet = RollingFleet(session, server, facing(0.3))
+        planned(fleet.tick, server)
+        for _ in range(8):
+            fleet.drive()
+        fleet.report()
+        for _ in range(2):
+            fleet.period += 5
+            server.tick(fleet.dt * fleet.period)
+            assert server.state == "waiting"
+            assert all(command[-1].linear.x == 0 for command in fleet.commands)
+        fleet.speeds[:] = 0.0
+        planned(fleet.tick, server)
+
+
+def test_an_emergency_stop_that_is_called_off_at_once_is_one() -> None:
+    with in_memory(facing(0.3)) as (session, server):
+        fleet = RollingFleet(session, server, facing(0.3))
+        planned(fleet.tick, server)
+        for _ in range(8):
+            fleet.drive()
+        for wanted in (True, True, False):
+            session.say("e_stop", ros.make(BOOL, wanted))
+        count = len(fleet.commands[0])
+        fleet.tick()
+        assert server.state == "waiting"
+        fleet.tick()
+        assert server.state == "planning"
+        assert {command.linear.x for command in fleet.commands[0][count:]} == {0}
+
+
+def test_an_emergency_stop_while_commands_are_sent_has_the_last_word() -> None:
+    """Whatever the loop is doing, it waits for the commands of one period at most, and nothing moves after it."""
+    with in_memory(facing(0.3)) as (session, server):
+        fleet = RollingFleet(session, server, facing(0.3))
+        planned(fleet.tick, server)
+        sending, go_on, stopping = threading.Event(), threading.Event(), threading.Event()
+        publisher = server._commands._twists[1]
+        publish = publisher.publish
+
+        def held_up(message: Any) -> None:
+            sending.set()
+            assert go_on.wait(60)
+            publish(message)
+
+        def stop() -> None:
+            stopping.set()
+            session.say("e_stop", ros.make(BOOL, True))
+
+        publisher.publish = held_up
+        loop, operator = threading.Thread(target=fleet.tick), threading.Thread(target=stop)
+        loop.start()
+        assert sending.wait(60)
+        operator.start()
+        assert stopping.wait(60)
+        go_on.set()
+        loop.join()
+        operator.join()
+        assert all(command[-1].linear.x == 0 for command in fleet.commands)
+        told = [len(command) for command in fleet.commands]
+        for _ in range(3):
+            fleet.tick()
+        assert all(
+            {one.linear.x for one in command[count:]} == {0}
+            for command, count in zip(fleet.commands, told, strict=True)
+        )
+
+
 def test_goals_of_one_moment_are_taken_together_and_known_ones_change_nothing() -> None:
     with in_memory(problem()) as (session, server):
         period = 0
@@ -452,7 +577,7 @@ def test_goals_of_one_moment_are_taken_together_and_known_ones_change_nothing() 
         planned(tick, server)
         assert tick((0, 0.6, 0.0)) == tick((1, 0.6, 1.0)) == "driving"
         assert tick((0, 0.6, 1.0)) == "driving"
-        assert "robot_0" in server.refusal
+        assert "robot_0" in server.wanted.refusal
         assert tick((1, 0.6, 0.0)) == "braking"
         np.testing.assert_allclose(server._problem.goal, problem().goal[::-1])
         planned(tick, server)
@@ -572,6 +697,7 @@ def test_strangers_bytes_are_counted(endpoint: str) -> None:
         ("problem: {scenario: circle}\nspeed: 2", "unknown field 'speed'"),
         ("problem: {scenario: circle}\nzenoh: {namespace: a}", "zenoh has 'namespace'"),
         ("problem: {scenario: circle}\nwire: dds", "wire 'dds' is unknown; choose one of rmw_zenoh, bridge"),
+        ("problem: {scenario: circle}\nwatchdog: 0.1", "watchdog is 0.1; it must be"),
         ("problem: {scenario: circle}\nrobots: [a/b]", "robots is ['a/b']"),
         ("problem: {scenario: circle}\npolicy: nobody", "nobody"),
         ("problem: {scenario: circle}\nrobots: [a, b]", "there are 2 names for 8 robots"),
