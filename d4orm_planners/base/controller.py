@@ -150,8 +150,6 @@ class Controller:
         self._observer, self._lead, self._robots = observer, lead, problem
         self._driven: deque[FloatArray] = deque(maxlen=OLDEST)
         self._open(problem, seed)
-        space, shape = self._env.state_space, problem.start.shape
-        self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
         self.states, _ = completed(problem, self._bounds, states, problem.start, lambda: problem.start)
         start = self._possible(self.states)
         team, tolerance = weaker(problem.team, 1 - self.reserve), problem.goal_heading_tolerance * (1 - self.reserve)
@@ -186,6 +184,8 @@ class Controller:
         measured = brought_up(self._robots, measured, known, self._driven, age)
         passed = (seconds(time) - self._time) / dt
         if abs(passed) >= SAME_PERIOD:
+            # Of what robots did in another time than a period nothing can be learned.
+            self._observer.observe(measured, known & (0 <= passed < 1 + SAME_PERIOD))
             self._setpoint = self._advance(measured, known)
             # Periods follow each other, so that frequent calls do not make the reference faster than the clock.
             self._time = float(time) if passed < 0 else max(self._time + dt, float(time) - LATE * dt)
@@ -235,6 +235,8 @@ class Controller:
         self.problem, self._ending = problem, None
         self._env = open_env(problem, policy=self.policy)
         self._observations, _ = self._env.reset(seed=seed)
+        space, shape = self._env.state_space, problem.start.shape
+        self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
 
     def _expected(self) -> FloatArray:
         """``(K, n)`` states that the last control led to from the last ones."""
@@ -247,7 +249,6 @@ class Controller:
     def _advance(self, measured: FloatArray, known: BoolArray) -> ControlSetpoint:
         rests = self.arrived & self.problem.docks
         self.states = measured
-        self._observer.observe(measured, known)
         if self.tracker:
             self._lead = self._observer.shifted(self._lead, self._joint.states, measured, known)
         if self._looks:

@@ -59,8 +59,8 @@ class FleetServer:
         seed: Of the controller.
         stamped: Whether robots' clocks are this machine's: states are as old as their stamps say then, and those older
             than the deadline, or from as far ahead, are not taken. Else they are of the moment in which they are read.
-        watchdog: Silence after which each robot stops by itself [s]. All are slowed down where they would come near to
-            anything if they heard nothing more; where that is not known, nothing is looked at.
+        watchdog: Silence after which each robot stops by itself [s], by default the deadline. All are slowed down where
+            they would come near to anything if they heard nothing more.
     """
 
     def __init__(
@@ -80,8 +80,11 @@ class FleetServer:
             raise ValueError(f"robots are called {', '.join(names)}; give each a name of its own")
         self.deadline = positive_number(deadline, "deadline", least=problem.dt)
         self._problem, self._controller, self._seed, self._stamped = problem, controller, seed, stamped
-        self._watchdog = watchdog if watchdog is None else positive_number(watchdog, "watchdog", least=2 * problem.dt)
-        self._running_on = None if watchdog is None else RunningOn(problem, watchdog)
+        least = 2 * problem.dt
+        self._watchdog = positive_number(
+            max(deadline, least) if watchdog is None else watchdog, "watchdog", least=least
+        )
+        self._running_on = RunningOn(problem, self._watchdog)
         self._robots = [FleetRobot(name, np.full(problem.state_size, np.nan, np.float32)) for name in names]
         self._odometry = [session.subscriber(f"{name}/odom", wire.ODOMETRY) for name in names]
         self._poses = [session.subscriber(f"{name}/pose", wire.POSE) for name in names]
@@ -120,7 +123,7 @@ class FleetServer:
     def tick(self, now: float) -> None:
         """One period: read what has come, and command every robot."""
         elapsed, self._looked = now - self._looked, now
-        if elapsed > (self._watchdog or self.deadline) and self.state in (DRIVING, BRAKING):
+        if elapsed > self._watchdog and self.state in (DRIVING, BRAKING):
             self._lose_all()
         self._read(now)
         before, self.state = self.state, self._next_state(now)
@@ -158,8 +161,8 @@ class FleetServer:
 
     def _begin(self, problem: Problem, states: FloatArray, now: float) -> None:
         self._controller.begin(problem, states, now, self._seed)
-        if self._running_on is not None:  # load, or compile, what it needs
-            self._running_on.meets_something(problem.start, np.zeros_like(problem.team.control_limits))
+        # Load, or compile, what it needs.
+        self._running_on.meets_something(problem.start, np.zeros_like(problem.team.control_limits))
 
     def _read(self, now: float) -> None:
         for number, robot in enumerate(self._robots):
@@ -242,8 +245,7 @@ class FleetServer:
     def _safe_paces(self, period: Period) -> Floats:
         """``(K, 1)`` paces of a period: lower where robots that heard nothing more would come near to things."""
         _, setpoint, twists = period
-        ahead = self._running_on
-        if ahead is None or not ahead.meets_something(self._controller.states, setpoint.control):
+        if not self._running_on.meets_something(self._controller.states, setpoint.control):
             return np.ones((len(twists), 1))
         return slowed(
             twists, self._commands.told, braking_share(self._problem, setpoint.velocity, setpoint.acceleration)

@@ -32,6 +32,7 @@ zenoh = pytest.importorskip("zenoh")
 typesys = pytest.importorskip("rosbags.typesys", reason="rosbags is not installed: pip install 'd4orm-env[ros]'")
 
 from d4orm_planners.serve.fleet_server import FleetServer  # noqa: E402
+from d4orm_planners.serve.running_on import RunningOn  # noqa: E402
 from d4orm_planners.serve.wire import (  # noqa: E402
     BOOL,
     ODOMETRY,
@@ -478,16 +479,20 @@ def test_robots_that_brake_are_led_on_from_where_they_are_when_the_loop_is_late(
         assert point.x == pytest.approx(fleet.poses[0, 0], abs=5e-3)
 
 
-@pytest.mark.parametrize("watchdog", [None, 0.2])
-def test_robots_that_hear_nothing_more_do_not_meet_before_their_watchdogs_stop_them(watchdog: float | None) -> None:
-    with in_memory(facing(0.13), watchdog=watchdog) as (session, server):
+@pytest.mark.parametrize("ahead", [True, False])
+def test_robots_that_hear_nothing_more_do_not_meet_before_their_watchdogs_stop_them(
+    ahead: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not ahead:
+        monkeypatch.setattr(RunningOn, "meets_something", lambda *_: False)
+    with in_memory(facing(0.13), watchdog=0.2) as (session, server):
         fleet, gaps = RollingFleet(session, server, facing(0.13)), []
         planned(fleet.tick, server)
         for _ in range(100):
             fleet.drive()
             told = np.array([command[-1].linear.x for command in fleet.commands])
             gaps.append(fleet.poses[1, 0] - fleet.poses[0, 0] - 0.2 * told.sum() - 0.2)
-    assert (min(gaps) > 0) == (watchdog is not None)
+    assert (min(gaps) > 0) == ahead
     np.testing.assert_allclose(fleet.poses[:, 0], [-0.13, 0.13], atol=0.061)
 
 
