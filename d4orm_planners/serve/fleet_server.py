@@ -183,9 +183,11 @@ class FleetServer:
     def _mind(self, e_stop: Subscriber) -> None:
         """Stop all robots at once on an emergency stop, whatever the loop is doing."""
         with self._commanding:
-            for message in e_stop.take():
-                self._emergency = bool(message.data)
-                if self._emergency:
+            unreadable = e_stop.refused
+            orders = [bool(message.data) for message in e_stop.take()]
+            for order in orders + (e_stop.refused > unreadable) * [True]:  # what cannot be read is one
+                self._emergency = order
+                if order:
                     self._replan, self._pace, self._stops = True, 0.0, self._stops + 1
                     self._stand()
 

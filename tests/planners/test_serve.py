@@ -528,6 +528,27 @@ def test_an_emergency_stop_that_is_called_off_at_once_is_one() -> None:
         assert {command.linear.x for command in fleet.commands[0][count:]} == {0}
 
 
+def test_an_emergency_stop_that_cannot_be_read_is_one() -> None:
+    with in_memory(facing(0.3)) as (session, server):
+        fleet = RollingFleet(session, server, facing(0.3))
+        planned(fleet.tick, server)
+        take = server._e_stop.take
+
+        def unreadable() -> list[Any]:
+            server._e_stop.refused += 1
+            return []
+
+        server._e_stop.take = unreadable
+        session.say("e_stop", None)
+        server._e_stop.take = lambda: take() and []
+        fleet.tick()
+        assert server.state == "stopped"
+        assert all(command[-1].linear.x == 0 for command in fleet.commands)
+        server._e_stop.take = take
+        session.say("e_stop", ros.make(BOOL, False))
+        planned(fleet.tick, server)
+
+
 def test_an_emergency_stop_while_commands_are_sent_has_the_last_word() -> None:
     """Whatever the loop is doing, it waits for the commands of one period at most, and nothing moves after it."""
     with in_memory(facing(0.3)) as (session, server):
