@@ -56,7 +56,7 @@ class Controller:
         reserve: Share of the robots' limits on speed, acceleration and turn rate, and of what goal headings may be
             missed by, that the reference leaves to the feedback, in mode ``"nominal"`` or with a tracker. By default
             0.5 with a tracker, which has its robot tilt or turn before it can push, 0.2 in mode ``"nominal"`` without,
-            else none.
+            else none. With a tracker, robots also dock more slowly by that share.
         timeout: Longest time that a step takes [s], ``None`` for any. The policy is waited for as long as what comes
             after fits in; then robots brake, and its late answer is not used. A named policy with a ``deadline``, as
             D4orm-C2F, gets four fifths of it.
@@ -152,8 +152,11 @@ class Controller:
         self._open(problem, seed)
         self.states, _ = completed(problem, self._bounds, states, problem.start, lambda: problem.start)
         start = self._possible(self.states)
-        team, tolerance = weaker(problem.team, 1 - self.reserve), problem.goal_heading_tolerance * (1 - self.reserve)
-        self._open(problem.with_state(start, problem.goal, team=team, goal_heading_tolerance=tolerance), seed)
+        left = 1 - self.reserve
+        within = {"team": weaker(problem.team, left), "goal_heading_tolerance": problem.goal_heading_tolerance * left}
+        if self.tracker:  # which has no more than setpoints to stop with; controls have all that a robot can
+            within["goal_speed"] = problem.goal_speed * left
+        self._open(problem.with_state(start, problem.goal, **within), seed)
         self.policy.reset(self._env, seed=seed)
         # A tracker follows by itself, and what a policy looks at is as without a lag.
         own = ActuatorLag(self.lag * (not (self.tracker or self._looks)), problem.dt)

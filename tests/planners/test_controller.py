@@ -192,6 +192,20 @@ def test_robots_with_trackers_lead_and_are_led() -> None:
     assert (np.linalg.norm(states[:, :2] - problem.goal, axis=1) < problem.goal_radius + 0.5 * deflected).all()
 
 
+@pytest.mark.parametrize("reserve", [0.5, 0.7])
+def test_setpoints_of_a_tracker_stop_within_the_limits(reserve: float) -> None:
+    problem = make_problem("circle", 1, robot="crazyflie", height=1.0, diameter=2.0, horizon=120)
+    states, asked = problem.start.copy(), []
+    with Controller("go-to-goal", tracker=True, reserve=reserve) as controller:
+        controller.begin(problem, states)
+        for step in range(problem.horizon):
+            s = controller.step(states, step * problem.dt)
+            states = np.concatenate([s.position, s.velocity], axis=1).astype(np.float32)
+            asked.append(np.linalg.norm(s.acceleration, axis=1).max())
+    assert controller.arrived.all()
+    assert max(asked) <= 1.001 * problem.team.max_acceleration.max()
+
+
 @pytest.mark.parametrize("model", ["holonomic2d", "velocity2d"])
 def test_undelayed_states_obey_the_model(model: str) -> None:
     second = model == "holonomic2d"
