@@ -5,9 +5,10 @@
 Teams of `robot="crazyflie"`, with its radius, limits and margin: a swap of ten among obstacles, a circle of eight in a
 slab of 0.5 m, and ten that rise from a grid to a figure of eight, in an order drawn anew. Plans of `hybrid` are sampled
 at 100 Hz and flown as they are, in calm air, and with gusts of 0.02 N and 5% more mass than the drones' controller
-reckons with. With those, D4orm-C2F flies the teams in a `Controller`, whose reference the drones follow: in mode
-"nominal" without looking at them, in mode "measured" the reference goes towards them; so they do with a low battery,
-which takes 12% of the thrust, in calm air. It needs crazyflow, `--trials` does not.
+reckons with, at their margin and at the one that the page advises for that. With those, D4orm-C2F flies the teams in a
+`Controller`, whose reference the drones follow: in mode "nominal" without looking at them, in mode "measured" the
+reference goes towards them; so they do with a low battery, which takes 12% of the thrust, in calm air. It needs
+crazyflow, `--trials` does not.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from examples.common import grouped, require, save_table, study_parser, study_ro
 from examples.denoising import denoising_columns, denoising_of
 
 from d4orm_env import Problem, make_problem
+from d4orm_env.core.robot_types import ROBOTS
 from d4orm_planners import Controller, Plan, make_planner
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 
@@ -28,32 +30,34 @@ DISTURBED = {"gust": 0.02, "mass_factor": 1.05}
 CONDITIONS: dict[str, dict[str, float]] = {
     "open loop": {},
     "open loop, disturbed": DISTURBED,
+    "open loop, disturbed, margin 0.15": DISTURBED,
     "nominal, disturbed": DISTURBED,
     "measured, disturbed": DISTURBED,
     "nominal, low battery": {"thrust_factor": 0.88},
     "measured, low battery": {"thrust_factor": 0.88},
 }
+MARGINS = {"open loop, disturbed, margin 0.15": 0.15}  # of the others it is the robot's
 HORIZON = 150
 CALM = 10
 """Steps to fly on when all have arrived."""
 
 
-def figure(seed: int) -> Problem:
+def figure(seed: int, margin: float) -> Problem:
     """Ten drones from a grid above the floor to two rings one above the other, with room for the downwash."""
     angles = 2 * np.pi * np.arange(5) / 5
     rings = [np.stack([0.5 * np.sin(angles), 0 * angles, z + side * 0.5 * np.cos(angles)], axis=1)
-             for z, side in ((0.95, -1), (2.4, 1))]  # fmt: skip
+             for z, side in ((0.95, -1), (2.3 + margin, 1))]  # fmt: skip
     grid = [[0.6 * x, 0.6 * y, 0.5, 0, 0, 0] for x in range(-2, 3) for y in (-1, 0)]
     goals = np.random.default_rng(seed).permutation(np.concatenate(rings))
     return make_problem(
-        "circle", 10, robot=ROBOT, height=1.0, horizon=HORIZON, bounds=[[-3, -3, 0.2], [3, 3, 3.2]]
+        "circle", 10, robot=ROBOT, height=1.0, horizon=HORIZON, margin=margin, bounds=[[-3, -3, 0.2], [3, 3, 3.2]]
     ).replace(start=grid, goal=goals, name="figure")
 
 
-def problem_of(scenario: str, seed: int) -> Problem:
-    common: dict[str, Any] = {"robot": ROBOT, "height": 1.0, "horizon": HORIZON}
+def problem_of(scenario: str, seed: int, margin: float = ROBOTS[ROBOT].margin) -> Problem:
+    common: dict[str, Any] = {"robot": ROBOT, "height": 1.0, "horizon": HORIZON, "margin": margin}
     if scenario == "figure of ten":
-        return figure(seed)
+        return figure(seed, margin)
     if scenario == "circle of eight":
         return make_problem("circle", 8, seed, diameter=4.0, bounds=[[-3, -3, 0.75], [3, 3, 1.25]], **common)
     return make_problem("swap", 10, seed, num_obstacles=4, bounds=[[-4, -3, 0.3], [4, 3, 2]], **common)
@@ -90,7 +94,8 @@ def fly(scenario: str, condition: str, seed: int) -> dict[str, Any]:
     """The row of a flight."""
     from d4orm_env.crazyflow import DroneBodies, DronePhysics
 
-    problem, mode = problem_of(scenario, seed), condition.partition(",")[0]
+    problem = problem_of(scenario, seed, MARGINS.get(condition, ROBOTS[ROBOT].margin))
+    mode = condition.partition(",")[0]
     bodies = DroneBodies(problem, np.zeros(0, np.float32), DronePhysics(**CONDITIONS[condition]))
     bodies.begin(seed)
     denoising: dict[str, float | None] = dict.fromkeys(denoising_of([]))
