@@ -63,7 +63,7 @@ class Controller:
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
             setpoints come later by the largest: with it robots can drive as the reference does. In mode ``"measured"``
             the policy sees robots as they would be without it. By default it is the team's; of a team without one it is
-            found, as robots driven by accelerations drive in mode ``"measured"`` without a tracker.
+            found, as robots driven by accelerations drive without a tracker.
         tracker: True if robots follow positions and velocities by a controller of their own, as drones do. Setpoints
             are shifted against a lasting distance from the reference, as a thrust that is too weak causes, up to the
             margin. In mode ``"measured"`` the reference goes towards what was measured by ``dt / (dt + 2 lag)`` of the
@@ -100,6 +100,8 @@ class Controller:
         self._looks = mode == "measured" and not isinstance(self.policy, OpenLoop)
         self._given_lag = lag if lag is None else check_lag(lag)
         self._leads = self.tracker or not self._looks
+        # A tracker follows by itself, and what a policy looks at is as without a lag.
+        self._steers = self._leads and not self.tracker
         self._background: Background[Actions] = Background()
         self._limit = TimeLimit()
         self._env: Any = None
@@ -141,7 +143,7 @@ class Controller:
 
     def _begin(self, problem: Problem, states: ArrayLike, time: float, seed: int) -> None:
         lag, known = self._given_lag, problem.team.lag
-        if lag is None and (known.any() or self.tracker or not self._looks):  # else it is found
+        if lag is None and (known.any() or self.tracker):  # else it is found
             lag = known
         observer, lead = DisturbanceObserver(problem, lag), np.zeros_like(problem.goal, np.float64)
         if time >= self._time and self._observer.problem.team is problem.team:
@@ -158,8 +160,7 @@ class Controller:
             within["goal_speed"] = problem.goal_speed * left
         self._open(problem.with_state(start, problem.goal, **within), seed)
         self.policy.reset(self._env, seed=seed)
-        # A tracker follows by itself, and what a policy looks at is as without a lag.
-        own = ActuatorLag(self.lag * (not (self.tracker or self._looks)), problem.dt)
+        own = ActuatorLag(self.lag * self._steers, problem.dt)
         self._time, self._lagged = time - problem.dt, LaggedReference(problem, start, own)
         idle = self._joint.controls
         self._setpoint = self._described(Reference(start, start, idle, idle), held=False)
@@ -188,7 +189,8 @@ class Controller:
         passed = (seconds(time) - self._time) / dt
         if abs(passed) >= SAME_PERIOD:
             # Of what robots did in another time than a period nothing can be learned.
-            self._observer.observe(measured, known & (0 <= passed < 1 + SAME_PERIOD))
+            if self._observer.observe(measured, known & (0 <= passed < 1 + SAME_PERIOD)) and self._steers:
+                self._lagged.adopt(self._observer.lag)
             self._setpoint = self._advance(measured, known)
             # Periods follow each other, so that frequent calls do not make the reference faster than the clock.
             self._time = float(time) if passed < 0 else max(self._time + dt, float(time) - LATE * dt)

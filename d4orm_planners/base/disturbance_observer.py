@@ -93,8 +93,11 @@ class DisturbanceObserver:
         self.lag = ActuatorLag(constants, self.problem.dt)
         self._trust = self.problem.dt / (self.problem.dt + 2 * constants[:, None])
 
-    def observe(self, states: FloatArray, known: BoolArray) -> None:
-        """Learn from measured states ``(K, n)``, where they are known ``(K,)``, now and a step ago."""
+    def observe(self, states: FloatArray, known: BoolArray) -> bool:
+        """Learn from measured states ``(K, n)``, where they are known ``(K,)``, now and a step ago.
+
+        Returned is whether another lag than before has been found.
+        """
         now = np.take_along_axis(states, self._columns, axis=1).astype(np.float64)
         now[~known] = np.nan
         if self._before is not None and self._explained is not None:
@@ -105,9 +108,11 @@ class DisturbanceObserver:
             better = np.clip(self.bias + GAIN * left, -self._most, self._most)
             self.bias = np.where(self._observed[:, None] & np.isfinite(left), better, self.bias)
         self._before = now
-        if self._finder is not None and self._finder.observe(states, known):
-            self._set_lag(self._finder.constants)
-            self.applied = self._finder.applied
+        if self._finder is None or not self._finder.observe(states, known):
+            return False
+        self._set_lag(self._finder.constants)
+        self.applied = self._finder.applied
+        return True
 
     @property
     def driven(self) -> FloatArray:

@@ -77,12 +77,17 @@ class LaggedReference:
     """
 
     def __init__(self, problem: Problem, states: FloatArray, lag: ActuatorLag) -> None:
-        self.lag, self._problem, self._slowest = lag, problem, float(lag.constants.max())
-        self._filter = ActuatorLag(np.full_like(lag.constants, self._slowest), problem.dt)
-        self._ratio = (lag.constants / max(self._slowest, 1e-12))[:, None]
+        self._problem = problem
+        self.adopt(lag)
         at_rest, self._behind = np.zeros((len(states), problem.control_size), np.float32), np.zeros(states.shape)
         self._behind[:, : problem.dimension] -= self._slowest * present_velocities(problem, states, at_rest)
         self._filtered = self.applied = at_rest.astype(np.float64)
+
+    def adopt(self, lag: ActuatorLag) -> None:
+        """Go on as by actuators with another lag."""
+        self.lag, self._slowest = lag, float(lag.constants.max())
+        self._filter = ActuatorLag(np.full_like(lag.constants, self._slowest), self._problem.dt)
+        self._ratio = (lag.constants / max(self._slowest, 1e-12))[:, None]
 
     def follow(self, states: FloatArray, after: FloatArray, controls: FloatArray) -> Reference:
         """Return what follows a step of the other from states to others ``(K, n)`` by controls ``(K, m)``."""

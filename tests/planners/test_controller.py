@@ -73,11 +73,12 @@ def test_a_perfect_robot_drives_as_in_the_environment(mode: Any, model: str) -> 
     assert speeds.max() <= problem.team.max_speed.max() * (1 + 1e-5)
 
 
+@pytest.mark.parametrize("mode", ["nominal", "measured"])
 @pytest.mark.parametrize("model", ["holonomic2d", slow("differential_drive"), slow("car")])
-def test_a_lag_that_nobody_told_is_found(model: str) -> None:
+def test_a_lag_that_nobody_told_is_found(model: str, mode: Any) -> None:
     problem = team(model)
     lags = np.array([0.0, 0.15, 0.15, 0.3], np.float32)
-    with Controller("d4orm-c2f", mode="measured", refine="sync") as controller:
+    with Controller("d4orm-c2f", mode=mode, refine="sync") as controller:
         _, gap, setpoint = lagging(controller, problem, lags, 160)
         np.testing.assert_allclose(controller.lag, lags, atol=0.06)
         assert setpoint.arrived.all()
@@ -86,9 +87,10 @@ def test_a_lag_that_nobody_told_is_found(model: str) -> None:
         np.testing.assert_allclose(controller.lag, lags, atol=0.06, err_msg="the team goes on")
 
 
-def test_no_lag_is_found_where_there_is_none() -> None:
+@pytest.mark.parametrize("mode", ["nominal", "measured"])
+def test_no_lag_is_found_where_there_is_none(mode: Any) -> None:
     for disturbances in ([StateNoise(0.01, 0.1)], [ControlNoise(0.2)], [Bias(0.1)]):
-        controller = Controller("d4orm-c2f", mode="measured", refine="sync")
+        controller = Controller("d4orm-c2f", mode=mode, refine="sync")
         driven(controller, team("holonomic2d"), disturbances)
         np.testing.assert_array_equal(controller.lag, 0)
 
