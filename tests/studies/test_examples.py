@@ -24,13 +24,14 @@ import numpy as np
 import pytest
 import yaml
 from examples.common import save_table
-from examples.studies import draw_dynobench, dynobench, lifelong, solve_rates
+from examples.studies import draw_dynobench, dynobench, lifelong, solve_rates, zero_shot
 from examples.studies.paper.variants import CountedIpopt, ForgetfulC2F
 from examples.studies.settings_studies import irregular_circle
 from matplotlib.figure import Figure
 from PIL import Image
 
 from d4orm_env import load_dynobench, make_problem, navigation_v0, rollout
+from d4orm_env.core.robot_types import ROBOTS
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners import Plan, make_planner, make_policy, run_episode
 from d4orm_planners.evaluation.tables import read_parquet
@@ -928,6 +929,20 @@ def test_policies_are_rolled_out_among_walls(tmp_path: Path) -> None:
     assert sum(row["succeeded"] == "1 of 1" for row in rows) >= 3
     assert not (out / "policy_rates.csv").exists(), "nothing was measured on open ground"
     check_made_again("policy_rates", tmp_path, rows, of="policy_rates_walls")
+
+
+def test_margins_of_crazyflies_are_what_flights_lost_and_half_as_much_again() -> None:
+    """As the checklist has it: the robot's in calm air, what the page advises for them in gusts."""
+    parquet = pytest.importorskip("pyarrow.parquet")
+    advised = max(zero_shot.MARGINS.values())
+    rows = parquet.read_table(EXAMPLES / "studies" / "data" / "zero_shot.parquet").to_pylist()
+    assert {row["condition"] for row in rows} == set(zero_shot.CONDITIONS)
+    for row in rows:
+        assert row["contacts"] == row["fallen"] == 0
+        margin = zero_shot.MARGINS.get(row["condition"], ROBOTS[zero_shot.ROBOT].margin)
+        gusts = zero_shot.CONDITIONS[row["condition"]] == zero_shot.DISTURBED
+        assert 1.5 * (margin - row["gap"]) <= (advised if gusts else ROBOTS[zero_shot.ROBOT].margin)
+    assert all(row["arrived"] == row["robots"] for row in rows if row["condition"].startswith("nominal"))
 
 
 def test_count_of_seeds_below_one_is_refused(tmp_path: Path) -> None:
