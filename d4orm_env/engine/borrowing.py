@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from llvmlite import ir
 from llvmlite.ir import IRBuilder, Value
+from numba import typeof
 from numba.core import cgutils, types
 from numba.core.base import BaseContext
 from numba.core.datamodel.manager import DataModelManager
@@ -91,3 +92,8 @@ def _borrow(typing_context: TypingContext, struct: types.NamedTuple) -> Instruct
 
 borrow: Callable[[S], S] = _borrow
 """Hand on a kernel's own argument, a named tuple, by reference: its caller keeps the arrays alive."""
+
+
+def borrowed(struct: tuple[Any, ...]) -> _Borrowed:
+    """The type of a named tuple by reference."""
+    return _Borrowed(typeof(struct))

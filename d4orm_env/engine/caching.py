@@ -35,7 +35,7 @@ from d4orm_env.engine.kernel_files import KernelFiles, ShippedFiles, Turn, shipp
 
 P = ParamSpec("P")
 R_co = TypeVar("R_co", covariant=True)
-_NAMING = "structs by their fields"
+_NAMING = "structs by their fields, parts by their kernels"
 """Rule by which names in kernels differ; kernels named by another must not be loaded beside these."""
 _ROOM = 2**24
 """Bytes that all kernels of the package take, more or less."""
@@ -134,10 +134,10 @@ class _SourceKeyedCache(FunctionCache):
         with suppress(OSError):
             super().save_overload(sig, data)
 
-    def is_kept(self) -> bool:
-        """True if anything is kept, for the sources as they are now."""
+    def is_kept(self, sig: object = None) -> bool:
+        """True if anything is kept, or a signature, for the sources as they are now."""
         return any(
-            key[-1] == self._source_key and files.holds(key)
+            key[-1] == self._source_key and sig in (None, key[0]) and files.holds(key)
             for files in (self._shipped, self._cache_file)
             if files is not None
             for key in files._load_index()
@@ -214,3 +214,9 @@ def has_to_be_compiled(kernel: Kernel[..., object]) -> bool:
     """Check whether a kernel of :func:`cached_kernel` could be kept on disk and is not yet, for the present sources."""
     cache = getattr(kernel, "_cache", None)
     return isinstance(cache, _SourceKeyedCache) and not cache.is_kept()
+
+
+def is_kept(kernel: Kernel[..., object], sig: tuple[object, ...]) -> bool:
+    """Check whether a kernel of :func:`cached_kernel` is compiled for these types already, here or on disk."""
+    cache = getattr(kernel, "_cache", None)
+    return sig in kernel.signatures or (isinstance(cache, _SourceKeyedCache) and cache.is_kept(sig))

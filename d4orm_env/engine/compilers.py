@@ -5,6 +5,7 @@ Two thirds of its time are spent in Python.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, partial
@@ -152,9 +153,10 @@ def _parts_of_numba() -> list[Replacement]:
     """Replacements by which numba's own functions, which Python cannot call either, are parts of kernels."""
     target = cpu_target.target_context
     define, wrap = compiler.Compiler.define_pipelines, target.create_cfunc_wrapper
+    optimize = JITCodeLibrary._optimize_final_module
 
     def define_part(self: compiler.Compiler) -> Any:
-        if self.state.flags.no_cpython_wrapper and not isinstance(self.state.library, _PartLibrary):
+        if self.state.flags.no_cpython_wrapper and not isinstance(self, KernelCompiler | PartCompiler):
             self.state.library = _part(self.state)
         return define(self)
 
@@ -162,7 +164,19 @@ def _parts_of_numba() -> list[Replacement]:
         if not isinstance(library, _PartLibrary):
             wrap(library, *function)
 
+    def optimize_own(library: JITCodeLibrary) -> None:
+        # Kernels of several processes are loaded into one, where the linker takes parts of one name for the same; and
+        # numba numbers functions by process.
+        functions = [function for function in library._final_module.functions if not function.is_declaration]
+        names = sorted(function.name for function in functions if function.linkage == Linkage.external)
+        mark = hashlib.sha256("".join(names).encode()).hexdigest()[:16]
+        for function in functions:
+            if function.linkage == Linkage.linkonce_odr:
+                function.name += f".{mark}"
+        optimize(library)
+
     return [
+        (JITCodeLibrary, "_optimize_final_module", optimize_own),
         (compiler.Compiler, "define_pipelines", define_part),
         (target, "create_cfunc_wrapper", wrap_unless_part),
         (JITCodeLibrary, "add_linking_library", _link),

@@ -7,8 +7,10 @@ each has its own goals, state and clock. A single environment is a batch of one.
 from __future__ import annotations
 
 from functools import lru_cache, partial
-from typing import NamedTuple
+from threading import local
+from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -17,45 +19,92 @@ from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.dynamics.models import COMMON, names_of_codes
-from d4orm_env.engine.caching import Kernel
+from d4orm_env.dynamics.models import names_of_codes
+from d4orm_env.engine.borrowing import borrowed
 from d4orm_env.engine.compiling import aligned_zeros
-from d4orm_env.engine.episodes import RollOut, advance_worlds_kernel, roll_out_kernel
-from d4orm_env.engine.observing import ObservationSpec, observe_worlds_kernel
+from d4orm_env.engine.episodes import RollOut, advance_worlds, roll_out_kernel
+from d4orm_env.engine.observing import (
+    SENSED_TYPES,
+    ObservationSpec,
+    Scratch,
+    allocate_scratch,
+    observe_world,
+    observe_worlds,
+)
 from d4orm_env.engine.ray_casting import Surroundings, cast_rays
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.stepping import models_of_kernel
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_env.engine.tiles import STRIDE, allocate_boxes, pose_rows
+from d4orm_env.engine.tiles import BOX_TYPES, STRIDE, allocate_boxes, pose_rows, robot_unit
 from d4orm_env.engine.types import ObservationInputs, StepResult, WorldBatch, checked_controls
-from d4orm_env.engine.world_tiles import WorldArrays
+from d4orm_env.engine.units import Call, Types, address_of, compile_together, path_of
+from d4orm_env.engine.world_tiles import CONTACT_TYPES, WorldArrays, check_contacts
 
 SHARED = 2**15  #: Steps of all robots together from which on threads share the checks of a rollout
 
 
-class WorldKernels(NamedTuple):
-    """The kernels that step and observe teams of some models."""
-
-    roll_out: RollOut
-    observe_worlds: Kernel[[ProblemArrays, ObservationInputs, ObservationSpec, IntArray, FloatArray], None]
-    advance_worlds: Kernel[
-        [ProblemArrays, ObservationSpec, int, NDArray[np.uint8], WorldBatch, IntArray, FloatArray], None
-    ]
-
-
-def world_kernels(models: tuple[str, ...]) -> WorldKernels:
-    """Kernels for a team of these models. Rolling out, which a first plan waits for, has them by models as sampling;
-    the others are the same for all mixtures of common models.
-    """
-    own = models_of_kernel(models)
-    names = COMMON if set(own) <= set(COMMON) else own
-    return WorldKernels(roll_out_kernel(own), observe_worlds_kernel(names), advance_worlds_kernel(names))
+def roll_out_of(models: tuple[str, ...]) -> RollOut:
+    """The kernel that rolls teams of these models out."""
+    return roll_out_kernel(models_of_kernel(models))
 
 
 @lru_cache(maxsize=256)
-def kernels_of_codes(codes: bytes) -> WorldKernels:
-    """:func:`world_kernels` by the bytes of ``model_codes``."""
-    return world_kernels(names_of_codes(np.frombuffer(codes, np.int32)))
+def roll_out_of_codes(codes: bytes) -> RollOut:
+    """:func:`roll_out_of` by the bytes of ``model_codes``."""
+    return roll_out_of(names_of_codes(np.frombuffer(codes, np.int32)))
+
+
+_UNITS: dict[tuple[object, ...], IntArray] = {}
+"""By what decides what they are, up to :data:`_MOST_UNITS`."""
+_MOST_UNITS = 256
+
+
+def _units_of(arrays: ProblemArrays, view: ObservationSpec | None, caller: Any, *arguments: object) -> IntArray:
+    """``(N, 2)`` addresses of the units that a kernel calls, those of :data:`CONTACTS` and so on.
+
+    The first time they are compiled, together with the kernel if it is a module's. These are its arguments before them.
+    """
+    sight = view is not None and view.line_of_sight
+    key = caller, arrays.model_codes.tobytes(), arrays.footprints is None, arrays.turns_at_goals is None, sight
+    if key not in _UNITS:
+        if len(_UNITS) >= _MOST_UNITS:
+            _UNITS.clear()
+        units = _units(arrays, view)
+        kinds = (*map(numba.typeof, arguments), numba.int64[:, ::1])
+        compile_together([*dict.fromkeys(units), (path_of(caller), kinds)] if caller else [])
+        _UNITS[key] = np.array([address_of(*call) for call in units])
+    return _UNITS[key]
+
+
+def _units(arrays: ProblemArrays, view: ObservationSpec | None) -> list[Call]:
+    """The units of kernels for this problem."""
+    problem, rows, lines = borrowed(arrays), numba.float32[:, :, ::1], numba.float32[::1]
+    kinds: Types = problem, CONTACT_TYPES, numba.int64, lines, BOX_TYPES, numba.uint64[:, ::1]
+    units = [(path_of(check_contacts), kinds)]
+    if view is not None:
+        table = numba.float32[:, ::1]
+        kinds = problem, table, numba.float32, borrowed(view), SENSED_TYPES, table
+        units.append((path_of(observe_world), kinds))
+        kinds = problem, numba.int64, numba.int64, lines, rows
+        units += [(path_of(robot_unit, name), kinds) for name in names_of_codes(arrays.model_codes)]
+    return units
+
+
+_kept = local()
+
+
+def _scratch_of(arrays: ProblemArrays, view: ObservationSpec, num_bodies: int) -> Scratch:
+    """Room for kernels, which a thread keeps from call to call."""
+    poses = 0 if arrays.footprints is None else len(arrays.footprints.heading)
+    # Where all are observed, none must be marked as hidden from a call before.
+    size = arrays.goal.shape, poses, num_bodies, *view[1:]
+    if getattr(_kept, "size", None) != size:
+        _kept.size, _kept.scratch = size, allocate_scratch(arrays, view, num_bodies)
+    return _kept.scratch
+
+
+_PART = np.zeros(2, np.int64)
+"""For its type."""
 
 
 class CpuEngine:
@@ -81,9 +130,13 @@ class CpuEngine:
         self, arrays: ProblemArrays, layout: ObservationLayout, sight: ObservationInputs, out: FloatArray
     ) -> None:
         """Fill ``out`` ``(B, K, D)`` with what every robot of every world sees, inside the layout's bounds."""
-        arrays = typed(arrays)
-        kernel, view = kernels_of_codes(arrays.model_codes.tobytes()).observe_worlds, _view(layout)
-        self._threads.over(-(-len(out) // TILE), lambda part: kernel(arrays, sight, view, part, out))
+        arrays, view = typed(arrays), _view(layout)
+        size = arrays, view, sight.bodies.shape[1]
+        units = _units_of(arrays, view, observe_worlds, arrays, sight, view, _PART, out, _scratch_of(*size))
+        self._threads.over(
+            -(-len(out) // TILE),
+            lambda part: observe_worlds(arrays, sight, view, part, out, _scratch_of(*size), units),
+        )
 
     def cast_rays(
         self, arrays: ProblemArrays, layout: ObservationLayout, state: FloatArray, bodies: FloatArray, out: FloatArray
@@ -106,10 +159,14 @@ class CpuEngine:
         They share the problem of ``arrays``, but for starts and goals; ``batch.control`` holds their controls. ``out``
         ``(B, K, D)`` is filled with the observations of all but skipped worlds, or ``(0, K, D)`` with none.
         """
-        arrays = typed(arrays)
-        kernel, view = kernels_of_codes(arrays.model_codes.tobytes()).advance_worlds, _view(layout)
+        arrays, view = typed(arrays), _view(layout)
+        scratch = _scratch_of(arrays, view, 0)
+        units = _units_of(arrays, view, advance_worlds, arrays, view, max_cycles, orders, batch, _PART, out, scratch)
         self._threads.over(
-            -(-len(orders) // TILE), lambda part: kernel(arrays, view, max_cycles, orders, batch, part, out)
+            -(-len(orders) // TILE),
+            lambda part: advance_worlds(
+                arrays, view, max_cycles, orders, batch, part, out, _scratch_of(arrays, view, 0), units
+            ),
         )
 
     def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
@@ -169,14 +226,16 @@ def _rolled_out(
     arrived, collided, violated = np.zeros((3, rows, len(states)), np.bool_)
     rewards = np.empty((rows if checked else 0, len(states)), np.float32)
     state[0], arrived[0], control[1:] = states, before, controls
-    goal, inverse = arrays.goal[None], arrays.inverse_initial_distance[None]
+    goal, inverse = arrays.goal[None], arrays.inverse_initial_distance[None].copy()
     nothing = np.empty((0, 0, 2 * goal.shape[-1] + 1), np.float32)
     moments = WorldArrays(goal, inverse, state, control, arrived, nothing, collided, violated, rewards)
-    kernel, num_tiles = kernels_of_codes(arrays.model_codes.tobytes()).roll_out, -(-len(rewards) // TILE)
+    kernel, num_tiles = roll_out_of_codes(arrays.model_codes.tobytes()), -(-len(rewards) // TILE)
+    units = _units_of(arrays, None, None)
 
     def run(moves: bool, tiles: IntArray) -> None:
         w = aligned_zeros(len(states) * STRIDE + pose_rows(arrays.footprints) * TILE)
-        kernel(arrays, moments, moves, tiles, w, np.empty((len(states), 3), np.uint64), allocate_boxes(arrays))
+        near, boxes = np.empty((len(states), 3), np.uint64), allocate_boxes(arrays)
+        kernel(arrays, moments, moves, tiles, w, near, boxes, units)
 
     if threads is None or rewards.size < SHARED:
         run(True, np.array((0, num_tiles)))

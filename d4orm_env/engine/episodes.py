@@ -18,32 +18,33 @@ from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import (
     ONE,
-    OPTIONS,
     WITHOUT_ARRAYS,
     ZERO,
-    aligned_zeros,
     compiled,
     inlined,
     to_fixed_tuple,
 )
 from d4orm_env.engine.elementary import OPS
-from d4orm_env.engine.observing import ObservationSpec, allocate_sensed, observe
+from d4orm_env.engine.observing import (
+    ObservationSpec,
+    Scratch,
+    call_observe_world,
+    read_motion,
+    sense_robots,
+)
 from d4orm_env.engine.simd import TILE, use_wide_registers
 from d4orm_env.engine.stepping import PICK, dispatch, docking_of, make_stepper, models_key
 from d4orm_env.engine.tiles import (
     ARRIVED,
     DISTANCE2,
     STRIDE,
-    RobotMover,
     TeamBoxes,
-    allocate_boxes,
+    call_robot,
     measure_goal_distance,
-    motion_reader,
-    pose_rows,
-    robot_mover,
 )
 from d4orm_env.engine.types import MOVED, RESET, SKIP, STEP, WorldBatch
-from d4orm_env.engine.world_tiles import WorldArrays, check_contacts, load, load_world, store_world
+from d4orm_env.engine.units import CONTACTS, OBSERVATION, ROBOTS
+from d4orm_env.engine.world_tiles import Contacts, WorldArrays, call_check_contacts, load, load_world, store_world
 
 
 @compiled
@@ -106,13 +107,14 @@ def _close_step(batch: WorldBatch, order: np.uint8, max_cycles: int, b: int, s: 
 
 @inlined
 def _move_tile(
-    move_robot: RobotMover,
     arrays: ProblemArrays,
     batch: WorldBatch,
     orders: NDArray[np.uint8],
     first: int,
     count: int,
     w: FloatArray,
+    motion: FloatArray,
+    units: IntArray,
 ) -> None:
     """Step the worlds of a tile that are to be stepped; the others wait as if all their robots had docked."""
     num_robots = batch.arrived.shape[1]
@@ -121,7 +123,7 @@ def _move_tile(
             for k in range(num_robots):
                 w[k * STRIDE + ARRIVED * TILE + s] = ONE
     for k in range(num_robots):
-        move_robot(arrays, k, w)
+        call_robot(units[ROBOTS + k], arrays, k, 0, w, motion)
     for s in range(count):
         b = first + s
         if orders[b] == STEP:
@@ -130,56 +132,58 @@ def _move_tile(
             load_world(batch, b, s, w)
 
 
-@cache
-def advance_worlds_kernel(
-    names: tuple[str, ...],
-) -> Kernel[[ProblemArrays, ObservationSpec, int, NDArray[np.uint8], WorldBatch, IntArray, FloatArray], None]:
-    """A kernel that steps, resets and observes worlds, each as it is ordered to, for teams of these models.
+@compiled
+def _time_left(batch: WorldBatch, max_cycles: int, b: int) -> np.float32:
+    return np.float32(max(0.0, 1.0 - batch.steps[b] / max_cycles))
+
+
+@cached_kernel(**WITHOUT_ARRAYS)
+def advance_worlds(
+    arrays: ProblemArrays,
+    view: ObservationSpec,
+    max_cycles: int,
+    orders: NDArray[np.uint8],
+    batch: WorldBatch,
+    tile_range: IntArray,
+    out: FloatArray,
+    scratch: Scratch,
+    units: IntArray,
+) -> None:
+    """Step, reset and observe worlds, each as it is ordered to.
 
     Arguments are those of :meth:`~d4orm_env.engine.cpu.CpuEngine.advance`; ``tile_range`` is the first tile of worlds
-    and the one after the last. Starts and goals of ``arrays`` are not looked at.
+    and the one after the last, ``units`` are the addresses of units. Starts and goals of ``arrays`` are not looked at.
     """
-    move_robot = robot_mover(names)
-    read_motion = motion_reader(names)
-
-    @cached_kernel(variant="_".join(names), key=models_key(names), **OPTIONS)
-    def advance_worlds(
-        arrays: ProblemArrays,
-        view: ObservationSpec,
-        max_cycles: int,
-        orders: NDArray[np.uint8],
-        batch: WorldBatch,
-        tile_range: IntArray,
-        out: FloatArray,
-    ) -> None:
-        use_wide_registers()
-        num_robots, dimension = arrays.goal.shape
-        w = aligned_zeros(num_robots * STRIDE + pose_rows(arrays.footprints) * TILE)
-        near, boxes = np.empty((num_robots, 3), np.uint64), allocate_boxes(arrays)
-        sensed, arrays = allocate_sensed(num_robots, 0, dimension, view), borrow(arrays)  # a batch by value is quicker
-        for index in range(tile_range[0], tile_range[1]):
-            first, count = index * TILE, min(TILE, orders.shape[0] - index * TILE)
-            moving, busy = _prepare_tile(batch, orders, first, count)
-            if not busy:
+    use_wide_registers()
+    num_robots, dimension = arrays.goal.shape
+    arrays, view, batch = borrow(arrays), borrow(view), borrow(batch)
+    w, motion, sensed = scratch.w, scratch.motion, scratch.sensed
+    contacts = Contacts(batch.inverse, batch.bodies, batch.collided, batch.violated, batch.rewards)
+    for index in range(tile_range[0], tile_range[1]):
+        first, count = index * TILE, min(TILE, orders.shape[0] - index * TILE)
+        moving, busy = _prepare_tile(batch, orders, first, count)
+        if not busy:
+            continue
+        load(batch, first, w)
+        measure_goal_distance(num_robots, dimension, w)
+        if moving:
+            _move_tile(arrays, batch, orders, first, count, w, motion, units)
+        call_check_contacts(units[CONTACTS], arrays, contacts, first, w, scratch.boxes, scratch.near)
+        if out.shape[0] > 0:
+            read_motion(arrays, units, count, w, motion)
+        for b in range(first, first + count):
+            if orders[b] == SKIP:
                 continue
-            load(batch, first, w)
-            measure_goal_distance(num_robots, dimension, w)
-            if moving:
-                _move_tile(move_robot, arrays, batch, orders, first, count, w)
-            check_contacts(arrays, batch, first, w, boxes, near)
-            for b in range(first, first + count):
-                if orders[b] == SKIP:
-                    continue
-                _close_step(batch, orders[b], max_cycles, b, b - first, w)
-                if out.shape[0] > 0:
-                    time_left = np.float32(max(0.0, 1.0 - batch.steps[b] / max_cycles))
-                    observe(read_motion, arrays, batch, b, time_left, w, view, sensed, out[b])
-
-    return advance_worlds
+            _close_step(batch, orders[b], max_cycles, b, b - first, w)
+            if out.shape[0] > 0:
+                sense_robots(arrays, batch.arrived[b], b - first, w, motion, sensed)
+                call_observe_world(
+                    units[OBSERVATION], arrays, batch.goal[b], _time_left(batch, max_cycles, b), view, sensed, out[b]
+                )
 
 
 RollOut: TypeAlias = Kernel[
-    [ProblemArrays, WorldArrays, bool, IntArray, FloatArray, NDArray[np.uint64], TeamBoxes], None
+    [ProblemArrays, WorldArrays, bool, IntArray, FloatArray, NDArray[np.uint64], TeamBoxes, IntArray], None
 ]
 """A kernel of :func:`roll_out_kernel`."""
 
@@ -220,14 +224,14 @@ def roll_out_kernel(names: tuple[str, ...]) -> RollOut:
     no control. The motion comes first, if it ``moves``; then 64 moments at a time are checked, as if they were worlds:
     ``tiles`` ``(2,)`` are the first 64 and those after the last. ``w`` is zero, ``(K STRIDE + P TILE,)`` with ``P``
     rows of poses, and ``near`` ``(K, 3)``: see :mod:`~d4orm_env.engine.tiles`; ``boxes`` are of
-    :func:`~d4orm_env.engine.tiles.allocate_boxes`.
+    :func:`~d4orm_env.engine.tiles.allocate_boxes`, and ``units`` the addresses of units.
     """
     move_robot = dispatch({name: _stepper(MODELS[name]) for name in names})
 
     @cached_kernel(variant="_".join(names), key=models_key(names), **WITHOUT_ARRAYS)
     def roll_out(
         arrays: ProblemArrays, moments: WorldArrays, moves: bool, tiles: IntArray, w: FloatArray,
-        near: NDArray[np.uint64], boxes: TeamBoxes,
+        near: NDArray[np.uint64], boxes: TeamBoxes, units: IntArray,
     ) -> None:  # fmt: skip
         use_wide_registers()
         arrays, moments = borrow(arrays), borrow(moments)
@@ -247,9 +251,10 @@ def roll_out_kernel(names: tuple[str, ...]) -> RollOut:
                 continue
             for k in range(num_robots):
                 move_robot(arrays.model_codes[k], arrays, moments, t, k)
+        contacts = Contacts(moments.inverse, moments.bodies, moments.collided, moments.violated, moments.rewards)
         for tile in range(tiles[0], tiles[1]):
             load(moments, tile * TILE, w)
             measure_goal_distance(num_robots, dimension, w)
-            check_contacts(arrays, moments, tile * TILE, w, boxes, near)
+            call_check_contacts(units[CONTACTS], arrays, contacts, tile * TILE, w, boxes, near)
 
     return roll_out

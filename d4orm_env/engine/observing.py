@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import NamedTuple
 
 import numba
 import numpy as np
 from numba.extending import register_jitable
+from numpy.typing import NDArray
 
 from d4orm_env.core import observation
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
@@ -15,14 +15,14 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.engine.borrowing import borrow
-from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined
+from d4orm_env.engine.caching import cached_kernel
+from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, WITHOUT_ARRAYS, ZERO, aligned_zeros, compiled, inlined
 from d4orm_env.engine.ray_shapes import is_blocked
 from d4orm_env.engine.simd import TILE
-from d4orm_env.engine.stepping import models_key
-from d4orm_env.engine.tiles import STATE, STRIDE, MotionReader, motion_reader
-from d4orm_env.engine.types import ObservationInputs, WorldBatch
-from d4orm_env.engine.world_tiles import WorldArrays, load
+from d4orm_env.engine.tiles import STATE, STRIDE, TeamBoxes, allocate_boxes, call_robot, pose_rows
+from d4orm_env.engine.types import ObservationInputs
+from d4orm_env.engine.units import OBSERVATION, ROBOTS, UNIT, caller
+from d4orm_env.engine.world_tiles import load
 
 for _function in (
     observation.observe_robot,
@@ -54,16 +54,38 @@ class ObservationSpec(NamedTuple):
     line_of_sight: bool | None
 
 
-@numba.njit(nogil=True, **OPTIONS)
-def allocate_sensed(num_robots: int, num_bodies: int, dimension: int, view: ObservationSpec) -> observation.Sensed:
-    count = num_robots + num_bodies
-    return observation.Sensed(
-        np.empty((count, dimension), np.float32), np.empty((count, dimension), np.float32),
-        np.empty(count, np.float32), np.empty((num_robots, 2 * view.num_headings), np.float32),
-        np.empty(num_robots, np.float32),
-        np.zeros(count, np.bool_), np.empty((5, 1), np.float32),
-        np.empty((view.num_neighbors, 2), np.float32), np.empty((view.num_obstacles, 2), np.float32),
-    )  # fmt: skip
+_ROW, _ROWS = numba.float32[::1], numba.float32[:, ::1]
+SENSED_TYPES = numba.types.NamedTuple(
+    (_ROWS, _ROWS, _ROW, _ROWS, _ROW, numba.boolean[::1], _ROWS, _ROWS, _ROWS), observation.Sensed
+)
+"""As numba knows what is sensed."""
+
+
+class Scratch(NamedTuple):
+    """Room for kernels that observe worlds."""
+
+    w: FloatArray  #: Workspace, see :mod:`~d4orm_env.engine.tiles`
+    near: NDArray[np.uint64]  #: ``(K, 3)``
+    boxes: TeamBoxes
+    #: ``(K, TILE, d + 2 B)`` see :func:`~d4orm_env.engine.tiles.robot_unit`
+    motion: FloatArray
+    sensed: observation.Sensed
+
+
+def allocate_scratch(arrays: ProblemArrays, view: ObservationSpec, num_bodies: int) -> Scratch:
+    """Make room for the worlds of a problem, among so many bodies that are no robots."""
+    (num_robots, d), count = arrays.goal.shape, len(arrays.goal) + num_bodies
+    headings = 2 * view.num_headings
+    shapes = (count, d), (count, d), (count,), (num_robots, headings), (num_robots,), (count,), (5, 1)
+    kinds = [np.bool_ if name == "hidden" else np.float32 for name in observation.Sensed._fields]
+    tables = (view.num_neighbors, 2), (view.num_obstacles, 2)
+    return Scratch(
+        aligned_zeros(num_robots * STRIDE + pose_rows(arrays.footprints) * TILE),
+        np.empty((num_robots, 3), np.uint64),
+        allocate_boxes(arrays),
+        np.empty((num_robots, TILE, d + headings), np.float32),
+        observation.Sensed(*(np.zeros(shape, kind) for shape, kind in zip((*shapes, *tables), kinds, strict=True))),
+    )
 
 
 @compiled
@@ -118,67 +140,83 @@ def _sense_bodies(bodies: FloatArray, num_robots: int, sensed: observation.Sense
             sensed.velocity[num_robots + body, axis] = bodies[body, dimension + axis]
 
 
-@inlined
-def observe(
-    read_motion: MotionReader,
-    arrays: ProblemArrays,
-    worlds: WorldArrays | ObservationInputs | WorldBatch,
-    b: int,
-    time_left: np.float32,
-    w: FloatArray,
-    view: ObservationSpec,
-    sensed: observation.Sensed,
-    out: FloatArray,
-) -> None:
-    """Fill ``out`` ``(K, D)`` with what the robots of world ``b`` of a loaded tile see, inside the view's bounds."""
-    (num_robots, dimension), s, bounds = arrays.goal.shape, b % TILE, view.bounds
-    for k in range(num_robots):
-        for axis in range(dimension):
-            sensed.position[k, axis] = w[k * STRIDE + (STATE + axis) * TILE + s]
-        read_motion(arrays, k, s, w, sensed.velocity[k], sensed.heading[k])
-        sensed.arrived[k] = ONE if worlds.arrived[b, k] else ZERO
-        for axis in range(dimension):
-            if transition.absorbed(worlds.arrived[b, k], arrays.docks):
-                sensed.velocity[k, axis] = ZERO
-        sensed.radius[k] = arrays.radius[k]
-    for k in range(num_robots):
+@cached_kernel(**UNIT)
+def observe_world(
+    arrays: ProblemArrays, goal: FloatArray, time_left: np.float32, view: ObservationSpec,
+    sensed: observation.Sensed, out: FloatArray,
+) -> None:  # fmt: skip
+    """Fill ``out`` ``(K, D)`` with what the robots of a world see, inside the view's bounds."""
+    bounds = view.bounds
+    for k in range(goal.shape[0]):
         row = out[k]
         if view.line_of_sight is not None or view.squared_range < np.inf:
             _hide(
                 sensed.position[k], sensed.position, arrays.boxes, arrays.triangles, view.squared_range,
                 view.line_of_sight, sensed.ray, sensed.hidden,
             )  # fmt: skip
-        observation.observe_robot(k, arrays, worlds.goal[b], sensed, time_left, row)
+        observation.observe_robot(k, arrays, goal, sensed, time_left, row)
         for i in range(row.shape[0]):
             value = row[i]
             value = value if value > bounds[0, i] else bounds[0, i]
             row[i] = value if value < bounds[1, i] else bounds[1, i]
 
 
-@cache
-def observe_worlds_kernel(
-    names: tuple[str, ...],
-) -> Kernel[[ProblemArrays, ObservationInputs, ObservationSpec, IntArray, FloatArray], None]:
-    """A kernel that fills ``out`` ``(B, K, D)`` with what every robot of every world sees, for teams of these models.
+call_observe_world = caller(6)
+"""``(address, *arguments)``: call :func:`observe_world` as a unit."""
+
+
+@inlined
+def read_motion(arrays: ProblemArrays, units: IntArray, count: int, w: FloatArray, motion: FloatArray) -> None:
+    """Fill ``motion`` in the first worlds of a tile, see :func:`~d4orm_env.engine.tiles.robot_unit`."""
+    for k in range(motion.shape[0]):
+        call_robot(units[ROBOTS + k], arrays, k, count, w, motion)
+
+
+@inlined
+def sense_robots(
+    arrays: ProblemArrays,
+    arrived: BoolArray,
+    s: int,
+    w: FloatArray,
+    motion: FloatArray,
+    sensed: observation.Sensed,
+) -> None:
+    """Note where the robots of a world are, and how they move."""
+    num_robots, dimension = arrays.goal.shape
+    for k in range(num_robots):
+        at_rest = transition.absorbed(arrived[k], arrays.docks)
+        for axis in range(dimension):
+            sensed.position[k, axis] = w[k * STRIDE + (STATE + axis) * TILE + s]
+            sensed.velocity[k, axis] = ZERO if at_rest else motion[k, s, axis]
+        for column in range(sensed.heading.shape[1]):
+            sensed.heading[k, column] = motion[k, s, dimension + column]
+        sensed.arrived[k] = ONE if arrived[k] else ZERO
+        sensed.radius[k] = arrays.radius[k]
+
+
+@cached_kernel(**WITHOUT_ARRAYS)
+def observe_worlds(
+    arrays: ProblemArrays,
+    sight: ObservationInputs,
+    view: ObservationSpec,
+    tile_range: IntArray,
+    out: FloatArray,
+    scratch: Scratch,
+    units: IntArray,
+) -> None:
+    """Fill ``out`` ``(B, K, D)`` with what every robot of every world sees.
 
     ``arrays`` is the problem that the worlds share; its starts and goals are not looked at. ``tile_range`` is the first
-    tile of worlds and the one after the last.
+    tile of worlds and the one after the last. ``units`` are as in :func:`~d4orm_env.engine.episodes.advance_worlds`.
     """
-    read_motion = motion_reader(names)
-
-    @cached_kernel(variant="_".join(names), key=models_key(names), **OPTIONS)
-    def observe_worlds(
-        arrays: ProblemArrays, sight: ObservationInputs, view: ObservationSpec, tile_range: IntArray, out: FloatArray
-    ) -> None:
-        num_robots, dimension = arrays.goal.shape
-        w = aligned_zeros(num_robots * STRIDE)
-        sensed = allocate_sensed(num_robots, sight.bodies.shape[1], dimension, view)
-        arrays = borrow(arrays)
-        for index in range(tile_range[0], tile_range[1]):
-            first = index * TILE
-            load(sight, first, w)
-            for b in range(first, min(first + TILE, sight.state.shape[0])):
-                _sense_bodies(sight.bodies[b], num_robots, sensed)
-                observe(read_motion, arrays, sight, b, sight.time_left[b], w, view, sensed, out[b])
-
-    return observe_worlds
+    num_robots = arrays.goal.shape[0]
+    arrays, view, sensed = borrow(arrays), borrow(view), scratch.sensed
+    w, motion = scratch.w, scratch.motion
+    for index in range(tile_range[0], tile_range[1]):
+        first, count = index * TILE, min(TILE, sight.state.shape[0] - index * TILE)
+        load(sight, first, w)
+        read_motion(arrays, units, count, w, motion)
+        for b in range(first, first + count):
+            _sense_bodies(sight.bodies[b], num_robots, sensed)
+            sense_robots(arrays, sight.arrived[b], b - first, w, motion, sensed)
+            call_observe_world(units[OBSERVATION], arrays, sight.goal[b], sight.time_left[b], view, sensed, out[b])

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
+from numba import float32, int64, types
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
@@ -22,8 +23,9 @@ from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
-from d4orm_env.dynamics.models import MODEL_CODES, MODELS
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import Model, TimeStep
+from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.footprint_contacts import POSE, place_bodies, refine_pair
@@ -33,14 +35,15 @@ from d4orm_env.engine.stepping import (
     READ,
     WRITE,
     Docking,
-    dispatch,
     docking_of,
     make_stepper,
+    models_key,
     read2,
     read3,
     squared_gap2,
     squared_gap3,
 )
+from d4orm_env.engine.units import UNIT, caller
 
 # First rows of a robot in the workspace. A power of two in all would map the same row of every robot to the same cache
 # set.
@@ -54,8 +57,6 @@ WIDER = np.float32(1 + 2.0**-6)
 
 # Columns of ``near``.
 ROBOT, OBSTACLE, DYNAMIC = 0, 1, 2
-RobotMover: TypeAlias = Callable[[ProblemArrays, int, FloatArray], None]
-MotionReader: TypeAlias = Callable[[ProblemArrays, int, int, FloatArray, FloatArray, FloatArray], None]
 
 
 def _mover(model: Model) -> Callable[..., None]:
@@ -93,22 +94,6 @@ def _mover(model: Model) -> Callable[..., None]:
     return run
 
 
-@cache
-def robot_mover(names: tuple[str, ...]) -> RobotMover:
-    """``move_robot(arrays, k, w)`` for robots of these models.
-
-    It moves robot ``k`` one step in every world of the tile; its control rows hold the executed control afterwards.
-    """
-    move = dispatch({name: _mover(MODELS[name]) for name in names})
-
-    @inlined
-    def move_robot(arrays: ProblemArrays, k: int, w: FloatArray) -> None:
-        h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
-        move(arrays.model_codes[k], arrays.limits[k], h, docking_of(arrays, k), w[k * STRIDE : (k + 1) * STRIDE])
-
-    return move_robot
-
-
 @inlined
 def measure_goal_distance(num_robots: int, dimension: int, w: FloatArray) -> None:
     """Fill the squared distances from the positions to the goals."""
@@ -143,6 +128,10 @@ class TeamBoxes(NamedTuple):
     corners: FloatArray
     #: ``(K,)`` int64 numbers of the robots, of a big team by where its boxes begin along the first axis
     order: IntArray
+
+
+BOX_TYPES = types.NamedTuple((float32[:, :, ::1], int64[::1]), TeamBoxes)
+"""As numba knows them."""
 
 
 @register_jitable(nogil=True, **OPTIONS)
@@ -254,9 +243,9 @@ def _motion_reader(model: Model) -> Callable[..., None]:
     dimension, num_limits = model.dimension, len(model.limit_names)
 
     @compiled
-    def read(all_limits: FloatArray, o: int, s: int, w: FloatArray, velocity: FloatArray) -> None:
+    def read(all_limits: FloatArray, s: int, w: FloatArray, velocity: FloatArray) -> None:
         limits = to_fixed_tuple(all_limits, num_limits)
-        v = velocity_of(read_x(w, o + STATE * TILE, s), read_u(w, o + CONTROL * TILE, s), limits, OPS)
+        v = velocity_of(read_x(w, STATE * TILE, s), read_u(w, CONTROL * TILE, s), limits, OPS)
         for axis in range(dimension):
             velocity[axis] = v[axis]
 
@@ -264,29 +253,35 @@ def _motion_reader(model: Model) -> Callable[..., None]:
 
 
 @cache
-def motion_reader(names: tuple[str, ...]) -> MotionReader:
-    """``read_motion(arrays, k, s, w, velocity, heading)`` for robots of these models.
+def robot_unit(name: str) -> Kernel[[ProblemArrays, int, int, FloatArray, FloatArray], None]:
+    """``move_robot(arrays, k, looks, w, motion)`` for robots of a model: move one, or look how it moves.
 
-    It fills the velocity ``(d,)`` of robot ``k`` in world ``s``, and ``(2 B,)`` cosine and sine of its heading, zeros
-    without, and of the hitch angles of trailers.
+    With no ``looks`` robot ``k`` moves one step in every world of the tile; its control rows hold the executed control
+    afterwards. Else ``motion`` ``(K, TILE, d + 2 B)`` is filled in as many worlds: velocity, cosine and sine of the
+    heading, zeros without, and of the hitch angles of trailers, of ``B`` bodies.
     """
-    read_velocity = dispatch({name: _motion_reader(MODELS[name]) for name in names})
-    headings = np.full((1 + max(MODEL_CODES[name] for name in names), 1 + MOST_TRAILERS), -1)
-    for name in names:
-        model = MODELS[name]
-        if model.heading_index is not None:
-            own = model.heading_index, *(hitch for hitch, _ in model.trailers)
-            headings[MODEL_CODES[name], : len(own)] = own
+    model = MODELS[name]
+    move, read = _mover(model), _motion_reader(model)
+    headings = np.full(1 + MOST_TRAILERS, -1)
+    if model.heading_index is not None:
+        headings[: 1 + len(model.trailers)] = model.heading_index, *(hitch for hitch, _ in model.trailers)
 
-    @inlined
-    def read_motion(
-        arrays: ProblemArrays, k: int, s: int, w: FloatArray, velocity: FloatArray, heading: FloatArray
-    ) -> None:
-        code = arrays.model_codes[k]
-        read_velocity(code, arrays.limits[k], k * STRIDE, s, w, velocity)
-        for body in range(heading.shape[0] // 2):
-            index = headings[code, body]
-            heading[2 * body] = cosine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO
-            heading[2 * body + 1] = sine(w[k * STRIDE + index * TILE + s]) if index >= 0 else ZERO
+    @cached_kernel(variant=name, key=models_key((name,)), **UNIT)
+    def move_robot(arrays: ProblemArrays, k: int, looks: int, w: FloatArray, motion: FloatArray) -> None:
+        robot, limits, dimension = w[k * STRIDE : (k + 1) * STRIDE], arrays.limits[k], arrays.goal.shape[1]
+        if looks == 0:
+            h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
+            move(limits, h, docking_of(arrays, k), robot)
+        for s in range(looks):
+            own = motion[k, s]
+            read(limits, s, robot, own)
+            for body in range((own.shape[0] - dimension) // 2):
+                index, column = headings[body], dimension + 2 * body
+                own[column] = cosine(robot[index * TILE + s]) if index >= 0 else ZERO
+                own[column + 1] = sine(robot[index * TILE + s]) if index >= 0 else ZERO
 
-    return read_motion
+    return move_robot
+
+
+call_robot = caller(5)
+"""``(address, arrays, k, looks, w, motion)``: call a unit of :func:`robot_unit`."""

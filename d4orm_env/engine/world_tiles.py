@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import boolean, float32, types
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Whole
@@ -12,9 +13,10 @@ from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.engine import obstacles
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
 from d4orm_env.engine.footprint_contacts import POSE, meets_body, refine_static
-from d4orm_env.engine.simd import NOWHERE, TILE
+from d4orm_env.engine.simd import NOWHERE, TILE, use_wide_registers
 from d4orm_env.engine.tiles import (
     ARRIVED,
     BUFFER,
@@ -33,6 +35,7 @@ from d4orm_env.engine.tiles import (
     place_team,
 )
 from d4orm_env.engine.types import ObservationInputs, WorldBatch
+from d4orm_env.engine.units import UNIT, caller
 
 
 class WorldArrays(NamedTuple):
@@ -48,6 +51,22 @@ class WorldArrays(NamedTuple):
     collided: BoolArray  #: ``(B, K)`` bool, hard contact; those known already go in, all come out
     violated: BoolArray  #: ``(B, K)`` bool, within the margin
     rewards: FloatArray  #: ``(B, K)`` of each robot where it is
+
+
+class Contacts(NamedTuple):
+    """What contacts of ``B`` worlds are looked for with, and what is found, as in :class:`WorldArrays`."""
+
+    inverse: FloatArray
+    bodies: FloatArray
+    collided: BoolArray
+    violated: BoolArray
+    rewards: FloatArray
+
+
+CONTACT_TYPES = types.NamedTuple(
+    (float32[:, ::1], float32[:, :, ::1], boolean[:, ::1], boolean[:, ::1], float32[:, ::1]), Contacts
+)
+"""As numba knows them."""
 
 
 @inlined
@@ -144,10 +163,10 @@ def _bit(mask: np.uint64, s: int) -> np.uint64:
     return (mask >> np.uint64(s)) & np.uint64(1)
 
 
-@compiled
+@cached_kernel(**UNIT)
 def check_contacts(
     arrays: ProblemArrays,
-    worlds: WorldArrays | WorldBatch,
+    worlds: Contacts,
     first: int,
     w: FloatArray,
     boxes: TeamBoxes,
@@ -157,7 +176,8 @@ def check_contacts(
 
     ``boxes`` of :func:`~d4orm_env.engine.tiles.allocate_boxes` are overwritten, and so is ``near`` ``(K, 3)``.
     """
-    num_robots, count = arrays.radius.shape[0], min(TILE, worlds.state.shape[0] - first)
+    use_wide_registers()
+    num_robots, count = arrays.radius.shape[0], min(TILE, worlds.rewards.shape[0] - first)
     place_team(arrays.footprints, num_robots, w)
     enclose_team(count, w, boxes)
     for k in range(num_robots):
@@ -184,3 +204,7 @@ def check_contacts(
                 np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s]), worlds.inverse[own, k],
                 (np.float32(robots), np.float32(bounds), np.float32(dynamic)), arrays.collision_penalty, ONE,
             )  # fmt: skip
+
+
+call_check_contacts = caller(6)
+"""``(address, *arguments)``: call :func:`check_contacts` as a unit."""

@@ -6,6 +6,7 @@ import pkgutil
 import time
 from collections.abc import Callable
 from importlib import import_module
+from typing import Any
 
 import numpy as np
 import typer
@@ -16,7 +17,8 @@ from d4orm_env import engine, navigation_v0, paths
 from d4orm_env.disturbances import Dropout, Intruder, StateNoise
 from d4orm_env.dynamics.models import COMMON
 from d4orm_env.engine.caching import Kernel, check_can_be_kept, has_to_be_compiled
-from d4orm_env.engine.cpu import world_kernels
+from d4orm_env.engine.cpu import roll_out_of
+from d4orm_env.engine.tiles import robot_unit
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners import d4orm_c2f, manoeuvres, mapf, tracking
 from d4orm_planners import engine as sampling_engine
@@ -87,8 +89,9 @@ def _evade() -> None:
 
 def _step_environments() -> None:
     disturbances = [Dropout(0.5), StateNoise(0.1), Intruder()]
-    for arguments in ({}, {"lifelong": True}, {"disturbances": disturbances, "observed_rays": 4}):
-        env = navigation_v0.parallel_env(problem=compile_ahead.smallest_problem(TEAMS[0]), **arguments)
+    options: tuple[dict[str, Any], ...] = {}, {"lifelong": True}, {"disturbances": disturbances, "observed_rays": 4}
+    for models, arguments in ((TEAMS[0], options[1]), (TEAMS[0], options[2]), *((models, {}) for models in TEAMS[:-1])):
+        env = navigation_v0.parallel_env(problem=compile_ahead.smallest_problem(models), **arguments)
         env.reset(seed=0)
         zero = np.zeros(env.action_space(env.possible_agents[0]).shape, np.float32)
         env.step(dict.fromkeys(env.agents, zero))
@@ -106,10 +109,10 @@ def _kernels() -> list[Dispatcher[Callable[..., object]]]:
     modules = [import_module(f"{package.__name__}.{module.name}") for package in packages
                for module in pkgutil.iter_modules(package.__path__) if "jax" not in module.name]  # fmt: skip
     found = {name: value for module in modules for name, value in vars(module).items() if isinstance(value, Dispatcher)}
-    worlds = {kernel for models in TEAMS for kernel in world_kernels(models)}
     kernels: list[Kernel[..., object]] = [
         *found.values(),
-        *worlds,
+        *map(roll_out_of, TEAMS),
+        *map(robot_unit, COMMON),
         *map(score_kernel, TEAMS),
         *map(straight_kernel, COMMON),
         *map(reference_kernel, COMMON),

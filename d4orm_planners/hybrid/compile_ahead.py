@@ -15,7 +15,7 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.engine.caching import has_to_be_compiled
-from d4orm_env.engine.cpu import world_kernels
+from d4orm_env.engine.cpu import roll_out_of
 from d4orm_env.engine.threads import Threads
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.planner import Planner
@@ -39,7 +39,7 @@ def compile_for_planning(planner: Planner, problem: Problem, announce: Callable[
     ``announce`` is called before it begins, if there is anything to do.
     """
     models = problem.team.models
-    if not has_to_be_compiled(world_kernels(models).roll_out):
+    if not has_to_be_compiled(roll_out_of(models)):
         if has_to_be_compiled(score_kernel(models)) and _samples_first(planner, problem):
             announce()
             sample_once((models,))

@@ -69,7 +69,7 @@ def kernels() -> Iterator[tuple[str, Any]]:
     yield "search", search_kernel("differential_drive")
     yield "meetings", path_index._count_meetings
     yield "alternate", alternate
-    yield "roll out", cpu.world_kernels(("holonomic2d",)).roll_out
+    yield "roll out", cpu.roll_out_of(("holonomic2d",))
 
 
 @pytest.mark.slow

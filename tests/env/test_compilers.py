@@ -7,7 +7,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
-from llvmlite.binding import ModuleRef
+from llvmlite.binding import Linkage, ModuleRef
 from numba.core import compiler, event, ir, utils
 from numba.core.codegen import JITCodeLibrary
 from numba.core.errors import TypingError
@@ -18,7 +18,7 @@ from numba.core.targetconfig import TargetConfig
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.engine.caching import cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_env.engine.compiling import OPTIONS, UNCOUNTED, compiled
 
 
 @numba.njit
@@ -37,6 +37,11 @@ def _square(x: float) -> float:
 @compiled
 def _fourth_power(x: float) -> float:
     return _square(_square(x))
+
+
+@numba.njit(**UNCOUNTED | {"_dbg_optnone": True})
+def _apart(x: float) -> float:
+    return _fourth_power(x)
 
 
 def _joined(x: float) -> FloatArray:
@@ -59,6 +64,25 @@ def _kernel() -> Any:
     kernel: Any = cached_kernel(**OPTIONS)(_joined)
     kernel._cache = numba.core.caching.NullCache()
     return kernel
+
+
+def test_parts_of_different_kernels_have_different_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    # In a process that loads both from disk, one would be called for the other.
+    names: list[set[str]] = []
+    finalize = JITCodeLibrary._finalize_specific
+
+    def note(library: JITCodeLibrary) -> None:
+        functions = [function for function in library._final_module.functions if not function.is_declaration]
+        names.append({function.name for function in functions if function.linkage == Linkage.linkonce_odr})
+        finalize(library)
+
+    monkeypatch.setattr(JITCodeLibrary, "_finalize_specific", note)
+    for variant in ("once", "twice"):
+        kernel: Any = cached_kernel(variant=variant, **OPTIONS)(lambda x: _apart(x) + _apart(x + 1))
+        kernel._cache = numba.core.caching.NullCache()
+        kernel(2.0)
+    first, second = filter(None, names)
+    assert not first & second
 
 
 def test_machine_code_is_made_of_kernels_and_of_what_python_can_call(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,7 +22,7 @@ from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D
 from d4orm_env.dynamics.models import MODEL_CODES, MODELS, get_model, model_digest
 from d4orm_env.dynamics.transition import TimeStep, advance
 from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.cpu import kernels_of_codes, world_kernels
+from d4orm_env.engine.cpu import _UNITS, roll_out_of, roll_out_of_codes
 from d4orm_env.jax import functional
 from d4orm_env.verify import integrated
 from d4orm_env.verify.integrated import Integrated
@@ -76,7 +76,8 @@ def boat() -> Iterator[Model]:
     with forgetting(MODELS):
         register_model(BOAT)
         yield BOAT
-    kernels_of_codes.cache_clear()
+    roll_out_of_codes.cache_clear()
+    _UNITS.clear()
 
 
 ONE = 1
@@ -238,14 +239,12 @@ def test_a_code_that_is_no_models_is_refused(engine: str) -> None:
 
 
 def test_teams_of_common_models_share_kernels_that_know_no_other(boat: Model) -> None:
-    common, mixed = world_kernels(("holonomic2d",)), world_kernels(("velocity2d", "differential_drive"))
-    assert mixed._replace(roll_out=common.roll_out) == common
+    mixed = roll_out_of(("velocity2d", "differential_drive"))
+    assert mixed is roll_out_of(("holonomic2d", "velocity2d"))
     # A plan waits for no more models than it must.
-    assert common.roll_out.py_func.__qualname__.endswith("roll_out_holonomic2d")
-    assert mixed.roll_out is world_kernels(("holonomic2d", "velocity2d")).roll_out
-    with_boat = world_kernels(("holonomic2d", "boat"))
-    assert with_boat.roll_out is not common.roll_out
-    assert with_boat.roll_out.py_func.__qualname__.endswith("_holonomic2d_boat")
+    assert roll_out_of(("holonomic2d",)).py_func.__qualname__.endswith("roll_out_holonomic2d")
+    with_boat = roll_out_of(("holonomic2d", "boat"))
+    assert with_boat.py_func.__qualname__.endswith("_holonomic2d_boat")
 
 
 # The unicycle and the car.
