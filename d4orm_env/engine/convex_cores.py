@@ -162,6 +162,36 @@ def ball_meets_box(boxes: FloatArray, i: Whole, x: np.float32, y: np.float32, z:
     return bool(gap_x * gap_x + gap_y * gap_y + gap_z * gap_z <= ONE)
 
 
+@compiled
+def leaves_bounds(
+    f: FootprintArrays, bounds: FloatArray, i: Whole, position: tuple[np.float32, np.float32, np.float32],
+    extra: np.float32, core: FloatArray,
+) -> bool:  # fmt: skip
+    """Check whether body ``i``, whose core is placed about the robot's position, comes within ``extra`` of a bound."""
+    dimension = bounds.shape[1]
+    for axis in range(dimension):
+        low = high = ZERO
+        if dimension == 3:
+            high = f.wall_axes[i, axis]
+            low = -high
+        else:
+            low, high = np.float32(np.inf), np.float32(-np.inf)
+            for j in range(f.num_corners[i]):
+                low, high = min(low, core[CORNERS + 2 * j + axis]), max(high, core[CORNERS + 2 * j + axis])
+            low, high = low - f.rounding[i], high + f.rounding[i]
+        if position[axis] + (low - extra) <= bounds[0, axis] or position[axis] + (high + extra) >= bounds[1, axis]:
+            return True
+    return False
+
+
+@compiled
+def box_is_beyond(boxes: FloatArray, i: Whole, distance: np.float32, x: np.float32, y: np.float32) -> bool:
+    """Check whether a rounded box of the plane is farther from a position than ``distance``."""
+    gap_x, gap_y = max(boxes[i, 0] - x, x - boxes[i, 2], ZERO), max(boxes[i, 1] - y, y - boxes[i, 3], ZERO)
+    distance += boxes[i, 4]
+    return bool(gap_x * gap_x + gap_y * gap_y > distance * distance)
+
+
 Rectangle: TypeAlias = tuple[np.float32, np.float32, np.float32]
 """Half of the length and of the width, and how far ahead of the reference point the centre lies [m]."""
 Offset: TypeAlias = tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]

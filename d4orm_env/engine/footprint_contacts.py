@@ -14,10 +14,11 @@ from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, trailing_zeros
 from d4orm_env.engine.convex_cores import (
-    CORNERS,
     ball_meets_box,
     balls_within,
+    box_is_beyond,
     cores_within,
+    leaves_bounds,
     place_body,
     place_box,
     place_disc,
@@ -232,36 +233,6 @@ def refine_pair(
 
 
 @compiled
-def _leaves_bounds(
-    f: FootprintArrays, bounds: FloatArray, i: Whole, position: tuple[np.float32, np.float32, np.float32],
-    extra: np.float32, core: FloatArray,
-) -> bool:  # fmt: skip
-    """Check whether body ``i``, whose core is placed about the robot's position, comes within ``extra`` of a bound."""
-    dimension = bounds.shape[1]
-    for axis in range(dimension):
-        low = high = ZERO
-        if dimension == 3:
-            high = f.wall_axes[i, axis]
-            low = -high
-        else:
-            low, high = np.float32(np.inf), np.float32(-np.inf)
-            for j in range(f.num_corners[i]):
-                low, high = min(low, core[CORNERS + 2 * j + axis]), max(high, core[CORNERS + 2 * j + axis])
-            low, high = low - f.rounding[i], high + f.rounding[i]
-        if position[axis] + (low - extra) <= bounds[0, axis] or position[axis] + (high + extra) >= bounds[1, axis]:
-            return True
-    return False
-
-
-@compiled
-def _is_beyond(boxes: FloatArray, i: Whole, distance: np.float32, x: np.float32, y: np.float32) -> bool:
-    """Check whether a rounded box of the plane is farther from a position than ``distance``."""
-    gap_x, gap_y = max(boxes[i, 0] - x, x - boxes[i, 2], ZERO), max(boxes[i, 1] - y, y - boxes[i, 3], ZERO)
-    distance += boxes[i, 4]
-    return bool(gap_x * gap_x + gap_y * gap_y > distance * distance)
-
-
-@compiled
 def touches_static(
     f: FootprintArrays, arrays: ProblemArrays, k: Whole, position: tuple[np.float32, np.float32, np.float32],
     poses: FloatArray, stride: int, begin: Whole, extra: np.float32, buffer: FloatArray,
@@ -271,7 +242,7 @@ def touches_static(
     while i >= 0:
         if dimension == 2:
             _place_own(f, i, poses, stride, begin, buffer[:TILE])
-        if _leaves_bounds(f, arrays.bounds, i, position, extra, buffer[:TILE]):
+        if leaves_bounds(f, arrays.bounds, i, position, extra, buffer[:TILE]):
             return True
         i = np.int64(f.following[i])
     if index.clearance.shape[0] == 0:
@@ -284,7 +255,7 @@ def touches_static(
                 return True
             continue
         if item < arrays.boxes.shape[0]:
-            if _is_beyond(arrays.boxes, item, arrays.radius[k] + extra, x, y):
+            if box_is_beyond(arrays.boxes, item, arrays.radius[k] + extra, x, y):
                 continue
             place_box(arrays.boxes, item, x, y, buffer[TILE : 2 * TILE])
         else:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
+from contextlib import AbstractContextManager
 from functools import partial
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,7 +36,7 @@ LATE = 0.25  #: Share of a period by which a late step's successors may come ear
 IN_TIME = 0.8  #: Share of a step's timeout that is a policy's deadline
 
 
-class Controller:
+class Controller(AbstractContextManager["Controller"]):
     """A policy as a controller of real or simulated robots.
 
     It keeps a model of the team, the reference, which is stepped as the environment would be. Robots that have reached
@@ -109,9 +110,6 @@ class Controller:
         self._time, self._lead, self.clock_resets = np.inf, np.zeros(0), 0
         self._ending: JointState | None = None  # the reference once the episode is over
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
@@ -184,7 +182,8 @@ class Controller:
         """
         self._limit.begin(self.timeout)
         reference, dt = self._joint.states, self.problem.dt
-        measured, known = completed(self.problem, self._bounds, states, reference, self._expected)
+        expected = partial(advanced, self._robots, self.states, self._setpoint.control)
+        measured, known = completed(self.problem, self._bounds, states, reference, expected)
         measured = brought_up(self._robots, measured, known, self._driven, age)
         passed = (seconds(time) - self._time) / dt
         if abs(passed) >= SAME_PERIOD:
@@ -242,10 +241,6 @@ class Controller:
         self._observations, _ = self._env.reset(seed=seed)
         space, shape = self._env.state_space, problem.start.shape
         self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
-
-    def _expected(self) -> FloatArray:
-        """``(K, n)`` states that the last control led to from the last ones."""
-        return advanced(self._robots, self.states, self._setpoint.control)
 
     def _possible(self, states: FloatArray) -> FloatArray:
         """``(K, n)`` states within the robots' limits and the state space."""
