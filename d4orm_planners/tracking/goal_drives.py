@@ -103,8 +103,12 @@ def curves(ahead: Floats, left: Floats, turns: Floats, short: Floats) -> tuple[F
 def _run_in(ahead: Floats, left: Floats, turns: Floats, short: Floats, runs: Floats) -> tuple[Floats, Floats]:
     """The same, ``(V W, K, 6)``, of curves that end by straights forwards."""
     sine, cosine = portable.sin(turns), portable.cos(turns)
-    found = [curves(ahead - run * cosine, left - run * sine, turns, short) for run in runs]
-    sides, lengths = (np.concatenate(part) for part in zip(*found, strict=True))
+    begins = (ahead - runs * cosine).ravel(), (left - runs * sine).ravel()
+    found = curves(*begins, np.tile(turns, len(runs)), np.tile(short, len(runs)))  # all at once
+    sides, lengths = (
+        part.reshape(-1, *runs.shape, part.shape[-1]).swapaxes(0, 1).reshape(-1, len(ahead), part.shape[-1])
+        for part in found
+    )
     last = np.repeat(runs, len(lengths) // len(runs), axis=0)[..., None]
     return np.concatenate([sides, 0 * last], axis=-1), np.concatenate([lengths, last], axis=-1)
 
