@@ -85,6 +85,14 @@ def _count_near(robots: _Bodies, others: _Bodies, squared_distance: Array, extra
     Others are taken one by one where there are many samples: all pairs at once would be gigabytes.
     """
     num_robots, _, num_samples = robots.position.shape
+    if num_samples < LANES:
+        gaps = robots.position[:, None] - others.position[None]
+        near = (gaps**2).sum(axis=2) <= squared_distance[..., None]
+        if robots.placed is not None and others.placed is not None:
+            touch = footprints.pairs_within(robots.placed, others.placed, extra)
+            touch = jnp.moveaxis(footprints.of_robots(robots.footprints, touch, num_robots), 1, 0)
+            near &= jnp.moveaxis(footprints.of_robots(others.footprints, touch, len(others.position)), 0, 1)
+        return near.sum(axis=1, dtype=jnp.int32)
 
     def compare(other: Array, count: Array) -> Array:
         gaps = robots.position - others.position[other][None]
@@ -96,11 +104,7 @@ def _count_near(robots: _Bodies, others: _Bodies, squared_distance: Array, extra
             near &= footprints.of_robots(robots.footprints, touch, num_robots)
         return count + near.astype(jnp.int32)
 
-    nobody = jnp.zeros((num_robots, num_samples), jnp.int32)
-    if num_samples >= LANES:
-        return jax.lax.fori_loop(0, len(others.position), compare, nobody)
-    each = jax.vmap(partial(compare, count=nobody))(jnp.arange(len(others.position)))
-    return each.sum(axis=0, dtype=jnp.int32)
+    return jax.lax.fori_loop(0, len(others.position), compare, jnp.zeros((num_robots, num_samples), jnp.int32))
 
 
 def obstacle_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float32) -> Array:
