@@ -26,7 +26,7 @@ from d4orm_env.engine.episodes import RollOut, advance_worlds, roll_out_kernel
 from d4orm_env.engine.observing import (
     SENSED_TYPES,
     ObservationSpec,
-    Scratch,
+    WorldScratch,
     allocate_scratch,
     observe_world,
     observe_worlds,
@@ -93,7 +93,7 @@ def _units(arrays: ProblemArrays, view: ObservationSpec | None) -> list[Call]:
 _kept = local()
 
 
-def _scratch_of(arrays: ProblemArrays, view: ObservationSpec, num_bodies: int) -> Scratch:
+def _scratch_of(arrays: ProblemArrays, view: ObservationSpec, num_bodies: int) -> WorldScratch:
     """Room for kernels, which a thread keeps from call to call."""
     poses = 0 if arrays.footprints is None else len(arrays.footprints.heading)
     # Where all are observed, none must be marked as hidden from a call before.

@@ -27,7 +27,7 @@ from d4orm_env.engine.compiling import (
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.observing import (
     ObservationSpec,
-    Scratch,
+    WorldScratch,
     call_observe_world,
     read_motion,
     sense_robots,
@@ -146,7 +146,7 @@ def advance_worlds(
     batch: WorldBatch,
     tile_range: IntArray,
     out: FloatArray,
-    scratch: Scratch,
+    scratch: WorldScratch,
     units: IntArray,
 ) -> None:
     """Step, reset and observe worlds, each as it is ordered to.

@@ -61,7 +61,7 @@ SENSED_TYPES = numba.types.NamedTuple(
 """As numba knows what is sensed."""
 
 
-class Scratch(NamedTuple):
+class WorldScratch(NamedTuple):
     """Room for kernels that observe worlds."""
 
     w: FloatArray  #: Workspace, see :mod:`~d4orm_env.engine.tiles`
@@ -72,14 +72,14 @@ class Scratch(NamedTuple):
     sensed: observation.Sensed
 
 
-def allocate_scratch(arrays: ProblemArrays, view: ObservationSpec, num_bodies: int) -> Scratch:
+def allocate_scratch(arrays: ProblemArrays, view: ObservationSpec, num_bodies: int) -> WorldScratch:
     """Make room for the worlds of a problem, among so many bodies that are no robots."""
     (num_robots, d), count = arrays.goal.shape, len(arrays.goal) + num_bodies
     headings = 2 * view.num_headings
     shapes = (count, d), (count, d), (count,), (num_robots, headings), (num_robots,), (count,), (5, 1)
     kinds = [np.bool_ if name == "hidden" else np.float32 for name in observation.Sensed._fields]
     tables = (view.num_neighbors, 2), (view.num_obstacles, 2)
-    return Scratch(
+    return WorldScratch(
         aligned_zeros(num_robots * STRIDE + pose_rows(arrays.footprints) * TILE),
         np.empty((num_robots, 3), np.uint64),
         allocate_boxes(arrays),
@@ -201,7 +201,7 @@ def observe_worlds(
     view: ObservationSpec,
     tile_range: IntArray,
     out: FloatArray,
-    scratch: Scratch,
+    scratch: WorldScratch,
     units: IntArray,
 ) -> None:
     """Fill ``out`` ``(B, K, D)`` with what every robot of every world sees.

@@ -53,7 +53,7 @@ def robot_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float3
 
     def count(state: Array, squared_distance: Array) -> Array:
         bodies = None if f is None else footprints.place_robots(f, state, dimension)
-        robots = _Bodies(state[:, :dimension], f, bodies)
+        robots = _Placed(state[:, :dimension], f, bodies)
         return _count_near(robots, robots, squared_distance, extra)
 
     if f is not None or state.shape[-1] < LANES:
@@ -66,12 +66,12 @@ def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, e
     d, f, g = arrays.goal.shape[1], arrays.footprints, others.footprints
     distance = arrays.radius[:, None] + others.radius[None, :] + extra
     discs = f is None and g is None
-    robots = _Bodies(state[:, :d], f, None if discs else footprints.place_robots(f, state, d, arrays.radius))
-    moving = _Bodies(jnp.asarray(others.positions)[..., None], g, None if discs else footprints.place_bodies(others))
+    robots = _Placed(state[:, :d], f, None if discs else footprints.place_robots(f, state, d, arrays.radius))
+    moving = _Placed(jnp.asarray(others.positions)[..., None], g, None if discs else footprints.place_bodies(others))
     return _count_near(robots, moving, jnp.asarray(distance * distance), extra)
 
 
-class _Bodies(NamedTuple):
+class _Placed(NamedTuple):
     """``R`` robots, or what moves as they do."""
 
     position: Array  #: ``(R, d, S)``
@@ -79,7 +79,7 @@ class _Bodies(NamedTuple):
     placed: PlacedBodies | None  #: Their bodies, or ``None`` where all are discs
 
 
-def _count_near(robots: _Bodies, others: _Bodies, squared_distance: Array, extra: Array | np.float32) -> Array:
+def _count_near(robots: _Placed, others: _Placed, squared_distance: Array, extra: Array | np.float32) -> Array:
     """``(R, S)`` how many others a robot is within ``extra`` of, being nearer than the root of ``(R, O)``.
 
     Others are taken one by one where there are many samples: all pairs at once would be gigabytes.

@@ -13,7 +13,7 @@ from d4orm_planners.serve.wire import FleetRobot, RosSession
 from d4orm_planners.tracking import ros_messages as ros
 
 
-class Commands:
+class FleetCommands:
     """The topics on which a team is told what to do."""
 
     def __init__(self, session: RosSession, problem: Problem, robots: Sequence[FleetRobot]) -> None:

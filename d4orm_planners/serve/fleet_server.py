@@ -14,7 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_planners.base.controller import Controller
 from d4orm_planners.base.measured_states import OLDEST
 from d4orm_planners.serve import wire
-from d4orm_planners.serve.commands import Commands
+from d4orm_planners.serve.commands import FleetCommands
 from d4orm_planners.serve.running_on import RunningOn, slowed
 from d4orm_planners.serve.wanted_goals import WantedGoals
 from d4orm_planners.serve.wire import FleetRobot, RosSession, Subscriber, position_of, turned
@@ -91,7 +91,7 @@ class FleetServer:
         self._goals = [session.subscriber(f"{name}/goal", wire.POSE) for name in names]
         self.wanted = WantedGoals(names, self.deadline)  #: Goals that robots are sent to
         self._unusable = 0
-        self._commands = Commands(session, problem, self._robots)
+        self._commands = FleetCommands(session, problem, self._robots)
         self._diagnostics = session.publisher("diagnostics", wire.DIAGNOSTICS)
         self._planner = ThreadPoolExecutor(1, thread_name_prefix="serve")
         self._begun: Future[None] | None = None
