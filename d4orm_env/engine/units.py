@@ -31,7 +31,7 @@ CONTACTS, OBSERVATION, ROBOTS = range(3)
 Types: TypeAlias = tuple[types.Type, ...]
 """Types of a kernel's arguments."""
 Path: TypeAlias = tuple[str, ...]
-"""Where a kernel is: its module and name, or those of the function that makes it and the arguments of that."""
+"""Place of a kernel: its module and name, or those of the function that makes it and the arguments of that."""
 Call: TypeAlias = tuple[Path, Types]
 """A kernel, and what it is called with."""
 
@@ -41,7 +41,7 @@ UNIT: dict[str, Any] = WITHOUT_ARRAYS | {"no_cpython_wrapper": True}
 
 
 def address_of(path: Path, kinds: Types) -> tuple[int, int]:
-    """Where the machine code of a unit is, compiled if need be, and a digest of the types."""
+    """Address of a unit's machine code, which is compiled if need be, and a digest of the types."""
     unit = kernel_of(path)
     unit.compile(kinds)
     made = unit.overloads[kinds]

@@ -54,7 +54,7 @@ class WorldArrays(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """What contacts of ``B`` worlds are looked for with, and what is found, as in :class:`WorldArrays`."""
+    """Contacts of ``B`` worlds: numbers that they are looked for with, and results, as in :class:`WorldArrays`."""
 
     inverse: FloatArray
     bodies: FloatArray

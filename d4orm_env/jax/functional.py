@@ -187,8 +187,7 @@ def _arrays(problem: Problem) -> ProblemArrays:
     heading, tolerance = jnp.asarray(problem.goal_heading), jnp.asarray(problem.goal_heading_tolerance)
     angles = jnp.column_stack([heading, jnp.asarray(problem.goal_hitches)])
     directions = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=2)
-    gap2 = ((start[:, : team.dimension] - goal) ** 2).sum(axis=-1)
-    distance = jnp.sqrt(jnp.maximum(gap2, goal_radius**2))
+    distance = jnp.sqrt(jnp.maximum(((start[:, : team.dimension] - goal) ** 2).sum(axis=-1), goal_radius**2))
     if world.lower is None:
         bounds = jnp.array([[-jnp.inf] * team.dimension, [jnp.inf] * team.dimension], jnp.float32)
     else:

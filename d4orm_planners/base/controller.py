@@ -58,7 +58,7 @@ class Controller(AbstractContextManager["Controller"]):
             missed by, that the reference leaves to the feedback, in mode ``"nominal"`` or with a tracker. By default
             0.5 with a tracker, which has its robot tilt or turn before it can push, 0.2 in mode ``"nominal"`` without,
             else none. With a tracker, robots also dock more slowly by that share.
-        timeout: Longest time that a step takes [s], ``None`` for any. The policy is waited for as long as what comes
+        timeout: Longest time that a step is to take [s], ``None`` for any. It waits for the policy as long as what comes
             after fits in; then robots brake, and its late answer is not used. A named policy with a ``deadline``, as
             D4orm-C2F, gets four fifths of it.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and

@@ -85,6 +85,15 @@ def _steepest(normal: Floats, room: float, flat: Floats) -> tuple[Floats, float]
     return way / length, room / length
 
 
+def _least(room: float, brakes: float, speed_slack: float, reaction: float) -> float:
+    """The least speed away from each other of two that have so much room [m/s]."""
+    if room <= 0:
+        return -PARTING * room
+    lost = brakes * reaction
+    # As long as there is room no robot has to back off: zero velocities keep to all barriers.
+    return min(speed_slack + lost - float(np.sqrt(2 * brakes * room + lost**2)), 0.0)
+
+
 def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, speed_slack: float) -> Barriers:
     d = problem.dimension
     positions = joint.states[:, :d].astype(np.float64)
@@ -96,13 +105,7 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
     rows: list[tuple[int, int, Floats, float]] = []
 
     def add(one: int, other: int, normal: Floats, room: float, brakes: float, speed: float = 0.0) -> None:
-        if room > 0:
-            lost = brakes * reaction
-            # As long as there is room no robot has to back off: zero velocities keep to all barriers.
-            least = min(speed_slack + lost - np.sqrt(2 * brakes * room + lost**2), 0.0)
-        else:
-            least = -PARTING * room
-        rows.append((one, other, normal, least + speed))
+        rows.append((one, other, normal, _least(room, brakes, speed_slack, reaction) + speed))
 
     reaction = problem.dt if speed_slack else 0.0
     near = NEAR * problem.team.largest_radius + STOPS * float((speed**2 / (2 * acceleration)).max())

@@ -1,4 +1,4 @@
-"""What robots are told: speeds and turn rates, and setpoints."""
+"""Commands of a fleet: speeds and turn rates, and setpoints."""
 
 from __future__ import annotations
 

@@ -81,9 +81,8 @@ class FleetServer:
         self.deadline = positive_number(deadline, "deadline", least=problem.dt)
         self._problem, self._controller, self._seed, self._stamped = problem, controller, seed, stamped
         least = 2 * problem.dt
-        self._watchdog = positive_number(
-            max(deadline, least) if watchdog is None else watchdog, "watchdog", least=least
-        )
+        longest = max(deadline, least) if watchdog is None else watchdog
+        self._watchdog = positive_number(longest, "watchdog", least=least)
         self._running_on = RunningOn(problem, self._watchdog)
         self._robots = [FleetRobot(name, np.full(problem.state_size, np.nan, np.float32)) for name in names]
         self._odometry = [session.subscriber(f"{name}/odom", wire.ODOMETRY) for name in names]
