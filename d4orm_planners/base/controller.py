@@ -58,9 +58,9 @@ class Controller(AbstractContextManager["Controller"]):
             missed by, that the reference leaves to the feedback, in mode ``"nominal"`` or with a tracker. By default
             0.5 with a tracker, which has its robot tilt or turn before it can push, 0.2 in mode ``"nominal"`` without,
             else none. With a tracker, robots also dock more slowly by that share.
-        timeout: Longest time that a step is to take [s], ``None`` for any. It waits for the policy as long as what comes
-            after fits in; then robots brake, and its late answer is not used. A named policy with a ``deadline``, as
-            D4orm-C2F, gets four fifths of it.
+        timeout: Longest time that a step is to take [s], ``None`` for any. It waits for the policy as long as what
+            comes after fits in; then robots brake, and its late answer is not used. A named policy with a
+            ``deadline``, as D4orm-C2F, gets four fifths of it.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
             setpoints come later by the largest: with it robots can drive as the reference does. In mode ``"measured"``
             the policy sees robots as they would be without it. By default it is the team's; of a team without one it is
