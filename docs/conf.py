@@ -100,14 +100,14 @@ def _read_report(app: Any, page: str, source: list[str]) -> None:
     Its other links, and other pages' links to it, lead from page to page. Where it has several tables with headings,
     their title is left out.
     """
-    if page == "report":
+    if page == "background/report":
         report = HERE.parent / "examples" / "studies" / "REPORT.md"
         app.env.note_dependency(report)
-        text = report.read_text(encoding="utf-8").replace("](../../docs/", "](")
+        text = report.read_text(encoding="utf-8").replace("](../../docs/", "](../")
         text = re.sub(r"^\[Table\]\((.+)\)$", r"```{include} \1\n```", text, flags=re.MULTILINE)
         tables = r"```{include} \1\n:start-line: 2\n:heading-offset: 1\n```"
         source[0] = re.sub(r"^\[Tables\]\((.+)\)$", tables, text, flags=re.MULTILINE)
-    source[0] = source[0].replace("../examples/studies/REPORT.md", "report.md")
+    source[0] = source[0].replace("../examples/studies/REPORT.md", "background/report.md")
 
 
 def _write_generated(app: Any, config: Any) -> None:

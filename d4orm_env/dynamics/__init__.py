@@ -1,4 +1,4 @@
-"""Robot models, and what a model of one's own is made of: see ``docs/own_robot.md``."""
+"""Robot models, and what a model of one's own is made of: see ``docs/how_to/own_robot.md``."""
 
 from d4orm_env.dynamics.formulas import (
     between,

@@ -105,7 +105,7 @@ def register_model(model: Model) -> None:
             their limits, or moves a robot at rest.
     """
     if not isinstance(model, Model):
-        raise ValueError(f"register_model takes a Model, not {short_repr(model)}; see docs/own_robot.md")
+        raise ValueError(f"register_model takes a Model, not {short_repr(model)}; see docs/how_to/own_robot.md")
     MODELS.add(model.name, model)
 
 
@@ -114,7 +114,7 @@ def _admit(name: str, model: object) -> Model:
     if model in _BUILT_IN:
         return model
     if not isinstance(model, Model):
-        raise ValueError(f"model {name!r} is {short_repr(model)}; it must be a Model, see docs/own_robot.md")
+        raise ValueError(f"model {name!r} is {short_repr(model)}; it must be a Model, see docs/how_to/own_robot.md")
     if model.name != name:
         raise ValueError(f"model {name!r} calls itself {model.name!r}; offer it under that name")
     _check_attributes(model)

@@ -30,7 +30,7 @@ class Compiler(Protocol):
 OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 """No fast mathematics: only what IEEE 754 defines to the bit, in the order in which it is written. Multiply-adds do not
 fuse, sums are not regrouped, nothing is estimated; so a kernel gives the same bits on every processor, however wide its
-registers. What it costs is measured in docs/performance.md."""
+registers. What it costs is measured in docs/background/performance.md."""
 
 WITHOUT_ARRAYS: dict[str, Any] = OPTIONS | {"_nrt": False}
 """Options for kernels that make no arrays: without numba's reference counts."""

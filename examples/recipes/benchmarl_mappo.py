@@ -1,6 +1,6 @@
 """MAPPO of BenchMARL on a task of this package; any other of its algorithms for continuous actions does as well.
 
-pip install -e . benchmarl        # in an environment of its own, see docs/recipes.md
+pip install -e . benchmarl        # in an environment of its own, see docs/how_to/recipes.md
 python -m examples.recipes.benchmarl_mappo
 """
 
@@ -18,7 +18,7 @@ require("rl", "torchrl")
 try:
     from benchmarl.algorithms import MappoConfig
 except ImportError as error:
-    print(f"this example needs BenchMARL in an environment of its own, see docs/recipes.md ({error})", file=sys.stderr)
+    print(f"this example needs BenchMARL by itself, see docs/how_to/recipes.md ({error})", file=sys.stderr)
     raise SystemExit(2) from None
 import torch
 from benchmarl.experiment import Callback, Experiment, ExperimentConfig

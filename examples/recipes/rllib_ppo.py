@@ -1,6 +1,6 @@
 """PPO of RLlib (new API stack), one network for all robots.
 
-pip install -e . "ray[rllib]" torch        # in an environment of its own, see docs/recipes.md
+pip install -e . "ray[rllib]" torch        # in an environment of its own, see docs/how_to/recipes.md
 python -m examples.recipes.rllib_ppo
 """
 
@@ -16,7 +16,7 @@ from examples.recipes.task import WORLD, recipe_arguments, solved
 try:
     from ray.rllib.algorithms.ppo import PPOConfig
 except ImportError as error:
-    print(f"this example needs RLlib in an environment of its own, see docs/recipes.md ({error})", file=sys.stderr)
+    print(f"this example needs RLlib by itself, see docs/how_to/recipes.md ({error})", file=sys.stderr)
     raise SystemExit(2) from None
 from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig

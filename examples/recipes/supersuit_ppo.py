@@ -3,8 +3,8 @@
     python -m examples.recipes.supersuit_ppo
 
 Every robot is one environment of the vector. It is simple and works with any library that takes a PettingZoo
-environment; ``d4orm train`` learns from the same world many times faster (see docs/rl.md), because it steps all worlds
-in one compiled call.
+environment; ``d4orm train`` learns from the same world many times faster (see docs/tutorials/rl.md), because it steps
+all worlds in one compiled call.
 """
 
 from __future__ import annotations

@@ -4,7 +4,8 @@
     python -m examples.studies read_results --results evaluation
 
 Without `--results` it makes a small evaluation of its own. `--format` chooses which of the files is read; all hold the
-same rows, described in docs/evaluation.md. Needs pandas, pyarrow for Parquet, and pyrvo for its own evaluation.
+same rows, described in docs/tutorials/evaluation.md. Needs pandas, pyarrow for Parquet, and pyrvo for its own
+evaluation.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Draw the paper's scenarios, those with walls, and a map from a file: the pictures of docs/scenarios.md.
+"""Draw the paper's scenarios, those with walls, and a map from a file: the pictures of docs/reference/scenarios.md.
 
 python -m examples.studies scenario_pictures
 """

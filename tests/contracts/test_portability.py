@@ -84,7 +84,7 @@ def test_kernels_estimate_nothing_and_fuse_nothing() -> None:
         for pattern in (ESTIMATE, FUSED):
             found = pattern.search(assembly)
             assert found is None, f"kernel {name} has the instruction {found and found.group()}"
-        # Those of AVX2 take long on AMD's processors, see docs/performance.md.
+        # Those of AVX2 take long on AMD's processors, see docs/background/performance.md.
         assert name != "score" or MASKED_STORE.search(assembly) is None
         rooted += ROOT.search(assembly) is not None
     assert rooted >= 3  # the patterns match what the assembler writes on this processor

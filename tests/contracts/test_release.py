@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 REQUIRED = {canonicalize_name(Requirement(text).name) for text in PROJECT["dependencies"]}
 ROWS = re.findall(
-    r"^\| `(.+?)` \| (.+) \|$", (ROOT / "docs" / "api_policy.md").read_text(encoding="utf-8"), re.MULTILINE
+    r"^\| `(d4orm_[\w.]+)` \| (.+) \|$", (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8"), re.MULTILINE
 )
 PUBLIC = {module: re.findall(r"`(\w+)`", names) for module, names in ROWS}
 """The public names that the page of the policy lists, by module."""

@@ -27,7 +27,7 @@ from d4orm_planners.baselines.mmd.path_frame import FEATURES, MODES, PathFrame, 
 if TYPE_CHECKING:
     from d4orm_planners.baselines.mmd.planner import MMDConfig
 
-WEIGHTS = Path(__file__).with_name("weights.npz")  #: Weights of the package; `docs/planners/mmd.md` has their card
+WEIGHTS = Path(__file__).with_name("weights.npz")  #: See their card in `docs/background/planners/rivals.md`
 SIZE = 2 * MODES  #: Numbers of a motion: modes along the path's line, then across
 LEVELS = 9  #: Numbers by which the network is told how noisy a motion is
 CLIP = np.float32(4.0)  #: Deviations from the mean beyond which the network is not believed
