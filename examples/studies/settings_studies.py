@@ -10,28 +10,16 @@ steps, paired by seed).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-from examples.common import (
-    first_solutions,
-    is_solved,
-    mean_text,
-    save_table,
-    solved_columns,
-    study_trials,
-    trials_parser,
-)
-from examples.denoising import penalised_steps
-from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
+from examples.common import first_solutions, save_table, study_trials, trials_parser
+from examples.studies import AS_IN_THE_PAPER, FIRST_SEED, settings_rows
 from examples.studies.paper import variants
 from examples.studies.tune_rivals import TEAMS as TUNED_ON
 
 from d4orm_env import Problem
 from d4orm_planners import make_planner
-from d4orm_planners.evaluation.comparison import paired
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.rl.perturbed_scenarios import perturbed
@@ -201,37 +189,6 @@ def steps_and_samples() -> list[Block]:
     return [Block("circle", robots, settings, "100 x 256, the last 70% with 128 (default)") for robots in (8, 16)]
 
 
-def samples_needed(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
-    """A row per setting: the samples drawn until the first solution, where a trial without one counts twice."""
-
-    def samples(trial: Trial) -> float:
-        config = json.loads(trial.config)
-        each = config["num_samples"] * (1 - config["late_steps"] * (1 - config["late_samples"]))
-        return float(penalised_steps(trial) * each)
-
-    rows = []
-    for label, trials in groups.items():
-        test = None if label == reference else paired(trials, groups[reference], samples)
-        quartiles = np.percentile([samples(trial) for trial in trials], (25, 50, 75)) / 1000
-        travel = [trial.travel_time for trial in trials if is_solved(trial) and trial.travel_time is not None]
-        rows.append(
-            {"robots": team, column: label, **solved_columns(trials), "1000 samples": f"{quartiles[1]:.0f}",
-             "quartiles": f"{quartiles[0]:.0f}-{quartiles[2]:.0f}",
-             "travel time [s]": mean_text(travel),
-             "p (samples)": test and test.cost_p}
-        )  # fmt: skip
-    return rows
-
-
-def with_iterations(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
-    """:func:`first_solutions`, and the mean number of iterations of the successes."""
-    rows = []
-    for row in first_solutions(team, column, groups, reference):
-        solved = [trial.iterations for trial in groups[row[column]] if is_solved(trial)]
-        rows.append(dict(list(row.items())[:4]) | {"iterations": mean_text(solved, ".1f")} | row)
-    return rows
-
-
 def irregular_circle(seed: int, num_robots: int) -> Problem:
     """The paper's circle turned at random, starts and goals moved by up to 0.1 m on either axis."""
     problem = perturbed(seed, num_robots, base="paper_circle", shift=0.1, shrink=0.0)
@@ -249,13 +206,6 @@ def limited_jerk() -> list[Block]:
     settings = {"d4orm": d4orm(**PAPER)}
     models = ("holonomic2d", "holonomic2d_jerk")
     return [Block("paper_circle", size, settings, "d4orm", 20, model) for size in (4, 8) for model in models]
-
-
-def with_jerk(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
-    """:func:`first_solutions` without the tests, and the mean squared norm of the solutions' jerk."""
-    jerks = [trial.mean_squared_jerk for trial in groups[reference] if is_solved(trial)]
-    shown = list(first_solutions(team, column, groups, reference)[0].items())[:-2]
-    return [dict(shown) | {"jerk [m²/s⁶]": mean_text(jerks, ".3g")}]
 
 
 def algorithm_4() -> list[Block]:
@@ -277,26 +227,6 @@ def algorithm_4() -> list[Block]:
         Block("paper_circle", size, {label: written | own for label, own in block.items()}, next(iter(block)), 10)
         for size, block in blocks
     ]
-
-
-def executed(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
-    """A row per controller: successes and their travel times, and a test, where a failure counts twice the longest."""
-    times = [trial.travel_time or 0.0 for trials in groups.values() for trial in trials if trial.success]
-
-    def cost(trial: Trial) -> float:
-        return (trial.travel_time or 0.0) if trial.success else 2 * max(times, default=1.0)
-
-    rows = []
-    for label, trials in groups.items():
-        test = None if label == reference else paired(trials, groups[reference], cost)
-        done = [trial for trial in trials if trial.success]
-        rows.append(
-            {"team": team, column: label, **solved_columns(trials, lambda trial: trial.success),
-             "travel time [s]": mean_text([trial.travel_time for trial in done]),
-             "makespan [s]": mean_text([trial.makespan for trial in done]),
-             "p (travel time)": test and test.cost_p}
-        )  # fmt: skip
-    return rows
 
 
 def ipopt_starts() -> list[Block]:
@@ -321,39 +251,19 @@ def ipopt_starts() -> list[Block]:
     return blocks
 
 
-def solver_iterations(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
-    """A row per start: solutions, IPOPT's own iterations, and a test, where a failure counts twice the most."""
-    counts = {id(trial): trial.progress[-1].steps or 0 for trials in groups.values() for trial in trials}
-    worst = max(counts.values())
-
-    def cost(trial: Trial) -> float:
-        return counts[id(trial)] if is_solved(trial) else 2 * worst
-
-    rows = []
-    for label, trials in groups.items():
-        test = None if label == reference else paired(trials, groups[reference], cost)
-        rows.append(
-            {"team": team, column: label, **solved_columns(trials),
-             "iterations": mean_text([counts[id(trial)] for trial in trials], ".0f"),
-             "of the solved": mean_text([counts[id(trial)] for trial in trials if is_solved(trial)], ".0f"),
-             "p (iterations)": test and test.cost_p}
-        )  # fmt: skip
-    return rows
-
-
 COMPARISONS: Mapping[str, Comparison] = {
     "algorithm_4_parts": Comparison(
         "D4orm-C2F by the paper's Algorithm 4 with one thing changed: refinement, the window, where loops begin.",
         "controller", algorithm_4, quick={"coarse_samples": 64, "coarse_steps": 15, "num_samples": 32, "num_steps": 5},
-        first_seed=0, rows=executed,
+        first_seed=0, rows=settings_rows.executed,
     ),
     "ipopt_starts": Comparison(
         "IPOPT's own iterations in one start that is perturbed, as in the paper, or not.",
-        "start", ipopt_starts, quick={}, first_seed=2000, rows=solver_iterations,
+        "start", ipopt_starts, quick={}, first_seed=2000, rows=settings_rows.solver_iterations,
     ),
     "jerk_limits": Comparison(
         "D4orm with the paper's preset and limits on the jerk in the robots' dynamics.", "planner", limited_jerk,
-        team="{0.num_robots} of {0.model}", rows=with_jerk,
+        team="{0.num_robots} of {0.model}", rows=settings_rows.with_jerk,
     ),
     "irregular_circles": Comparison(
         "The paper's presets on circles turned at random, starts and goals moved by up to 0.1 m on either axis.",
@@ -370,7 +280,7 @@ COMPARISONS: Mapping[str, Comparison] = {
     "head_to_head": Comparison(
         "The paper as written, its authors' published code re-implemented, and this project's defaults.",
         "planner", presets_head_to_head, quick={"max_iterations": 2, "num_steps": 10, "num_samples": 64},
-        first_seed=0, rows=with_iterations,
+        first_seed=0, rows=settings_rows.with_iterations,
     ),
     "tuned_rivals": Comparison(
         "D4orm and its rivals as the paper has them and tuned with the same effort, on seeds that no tuning has seen. "
@@ -381,8 +291,8 @@ COMPARISONS: Mapping[str, Comparison] = {
     "fewer_samples": Comparison(
         "Samples until D4orm's first solution with fewer steps, fewer samples, or fewer while the noise is small: "
         "median, quartiles, and how likely a row and the defaults need equally many (Wilcoxon, paired by seed).",
-        "steps x samples", steps_and_samples, quick={"max_iterations": 1}, team="{0.num_robots}", rows=samples_needed,
-        study={"scenario_settings": AS_IN_THE_PAPER},
+        "steps x samples", steps_and_samples, quick={"max_iterations": 1}, team="{0.num_robots}",
+        rows=settings_rows.samples_needed, study={"scenario_settings": AS_IN_THE_PAPER},
     ),
 }  # fmt: skip
 """Every comparison by its name."""

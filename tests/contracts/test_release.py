@@ -21,9 +21,8 @@ import d4orm_env
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 REQUIRED = {canonicalize_name(Requirement(text).name) for text in PROJECT["dependencies"]}
-ROWS = re.findall(
-    r"^\| `(d4orm_[\w.]+)` \| (.+) \|$", (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8"), re.MULTILINE
-)
+API = (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8")
+ROWS = re.findall(r"^\| `(d4orm_[\w.]+)` \| (.+) \|$", API, re.MULTILINE)
 PUBLIC = {module: re.findall(r"`(\w+)`", names) for module, names in ROWS}
 """The public names that the page of the policy lists, by module."""
 OF_EXTRAS = ("d4orm_env.crazyflow", "d4orm_env.integrations.", "d4orm_env.mujoco")
