@@ -50,16 +50,22 @@ EXTRA = re.compile(
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 PRINTS = {
-    "tutorials/own_policy": "3.0 0.0\nin turn 1.0 0\nat once 0.0 0\ngently 0.0 0\ngo-to-goal 0.0 0\n",
-    "how_to/own_planner": "True solved True\nsolved\nsolved\n",
-    "how_to/own_robot": "solved True\n",
+    "tutorials/own_policy/mine.py": "3.0 0.0\nin turn 1.0 0\nat once 0.0 0\ngently 0.0 0\ngo-to-goal 0.0 0\n",
+    "how_to/own_planner/waiting.py": "True solved True\n",
+    "how_to/own_planner/page.py": "solved\nsolved\n",
+    "how_to/own_robot/page.py": "solved True\n",
 }
-"""What the programs of some pages print."""
+"""What some pages' programs print."""
 
 
-def programs(text: str) -> str:
-    """All of a page's Python in one, but for what needs files, robots or libraries that a test has not."""
-    return "\n".join(code for language, skip, code in FENCE.findall(text) if language == "python" and not skip)
+def programs(text: str) -> dict[str, str]:
+    """A page's Python by file: what it says to save, and the rest, which builds on that; not what a test lacks."""
+    codes = [code for language, skip, code in FENCE.findall(text) if language == "python" and not skip]
+    saved = re.search(r"Save this as\s+`(\w+\.py)`", text)
+    if not saved:
+        return {"page.py": "\n".join(codes)} if codes else {}
+    first, *rest = codes
+    return {saved.group(1): first, "page.py": "\n".join([f"from {saved.group(1)[:-3]} import *", *rest])}
 
 
 def commands(text: str) -> list[str]:
@@ -73,17 +79,17 @@ def commands(text: str) -> list[str]:
 @pytest.mark.slow
 def test_programs_run(page: str, tmp_path: Path) -> None:
     (tmp_path / "examples").symlink_to(ROOT / "examples")
-    name = match.group(1) if (match := re.search(r"Save this as\s+`(\w+\.py)`", PAGES[page])) else "page.py"
-    (tmp_path / name).write_text(programs(PAGES[page]), encoding="utf-8")
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    result = subprocess.run(
-        [sys.executable, name],
-        capture_output=True, text=True, check=False, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},
-    )  # fmt: skip
-    if result.returncode and (missing := EXTRA.search(result.stderr)):
-        pytest.skip(missing.group())
-    assert result.returncode == 0, result.stderr
-    assert PRINTS.get(page, result.stdout) == result.stdout
+    for name, code in programs(PAGES[page]).items():
+        (tmp_path / name).write_text(code, encoding="utf-8")
+        result = subprocess.run(
+            [sys.executable, name],
+            capture_output=True, text=True, check=False, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},
+        )  # fmt: skip
+        if result.returncode and (missing := EXTRA.search(result.stderr)):
+            pytest.skip(missing.group())
+        assert result.returncode == 0, result.stderr
+        assert PRINTS.get(f"{page}/{name}", result.stdout) == result.stdout
 
 
 @pytest.mark.parametrize("page", [page for page, text in PAGES.items() if commands(text)])
