@@ -1,7 +1,7 @@
 """D4orm-D: failure-aware decoupling for big teams (paper, section V, Algorithm 3).
 
-Robots that fail are replanned as the paper or its authors' code does (:mod:`~d4orm_planners.d4orm_d.decoupling`); by
-default they are repaired independently (:mod:`~d4orm_planners.d4orm_d.decoupling`).
+Robots that fail are replanned as the paper or its authors' code does, or by default repaired independently
+(:mod:`~d4orm_planners.d4orm_d.decoupling`).
 """
 
 from __future__ import annotations
