@@ -1,4 +1,4 @@
-"""A first-order holonomic ground robot: ``x = [px, py]``, ``u = [vx, vy]`` (paper, section VIII-D)."""
+"""A first-order holonomic ground robot: ``x = [px, py]``, ``u = [vx, vy]`` (paper, section VIII-E)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """One node of D-D4orm: refine, broadcast, collect, choose (paper, Algorithm 5); and its work in a thread.
 
-An observer may be told of all that it does, for timelines (section VIII-D).
+An observer may be told of all that it does, for timelines (section VIII-E).
 """
 
 from __future__ import annotations

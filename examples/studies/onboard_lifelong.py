@@ -2,7 +2,7 @@
 
     python -m examples.studies onboard_lifelong --minutes 2
 
-This is the paper's on-robot demonstration (section VIII) with a simulated world: the world tells all robots where they
+This is the paper's on-robot demonstration (section VIII-E) in a simulated world: the world tells all robots where they
 are, and each robot commands its own body. While they drive, the robots plan on from where they will be; every one draws
 its share of the samples and exchanges candidates with the others, and they execute the best plan that all have agreed
 on. ``--kill 2:20`` kills the process of robot 2 after 20 simulated seconds; the others go on around its body.
