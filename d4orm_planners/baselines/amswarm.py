@@ -1,4 +1,4 @@
-"""AMSwarm, the rival of the paper's section VIII-C: receding-horizon planning, every robot for itself.
+"""AMSwarm, ours after the rival of the paper's section VIII-C: receding-horizon planning, every robot for itself.
 
 Motions are Bernstein polynomials of the time, sampled at every step of a horizon (R. T. Farouki, *The Bernstein
 polynomial basis: a centennial retrospective*, Computer Aided Geometric Design, 2012).
@@ -216,8 +216,9 @@ class AMSwarmConfig(PlannerConfig):
 class AMSwarm(Planner):
     """Receding-horizon planning by alternating minimisation, every robot around what the others planned last.
 
-    Adajania, Zhou, Singh and Schoellig, ICRA 2023. An iteration is one run of the team from start to horizon. The
-    method speaks of holonomic robots: those with a heading follow their motions' velocities as well as they can.
+    After Adajania, Zhou, Singh and Schoellig, ICRA 2023, written anew. An iteration is one run of the team from start
+    to horizon. The method is for holonomic robots: those with a heading follow their motions' velocities as well as
+    they can, and may violate the margin.
     """
 
     name: ClassVar[str] = "amswarm"

@@ -1,1 +1,1 @@
-"""MMD: every robot's motion denoised by a diffusion model of single robots, conflicts resolved by a search."""
+"""MMD, ours after Shaoul et al.: diffusion of single robots' motions, conflicts resolved by a search."""
