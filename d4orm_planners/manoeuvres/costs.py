@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -33,9 +32,6 @@ LATER = 20
 """Steps by which a detour over a pose may be longer than the shortest path for its cost to be worked out."""
 TEAM_CELLS, LEAST_CELLS, MOST_CELLS = 4_000_000, 150_000, 400_000
 """Cells of the costs of all robots together, and the least and the most of one: a larger world has larger cells."""
-WITHIN = np.linspace(-0.9, 0.9, 5)
-"""Shares of the goal radius and of the heading tolerance in which poses lie at which a robot has arrived as well. In a
-tight place costs may not spread from the goal itself."""
 
 
 class Area(NamedTuple):
@@ -72,12 +68,19 @@ class Costs(NamedTuple):
     start: tuple[float, float]  #: ... which is at ``(x, y)``
 
 
+def unknown_costs(lattice: PoseLattice, pace: float = 0.0) -> Costs:
+    """Costs of which none is known but how many steps a metre takes at least."""
+    nowhere = lattice.usual._replace(size=(0, 0))
+    empty = PoseLattice(nowhere, lattice.heading, lattice.modes, (nowhere, nowhere))
+    return Costs(empty, np.zeros(1, np.float32), 0.0, pace, (0.0, 0.0))
+
+
 def costs_of(kind: Kind, area: Area, body: RobotBody, start: Floats, goal: Goal, team_size: int, bent: bool) -> Costs:
     """Steps to a goal for a robot that starts at a pose ``(6,)``, in a team of so many; ``bent`` if its trailers end in
     a bend.
     """
     modes, cells = primitives_of(kind)[2], np.clip(TEAM_CELLS / team_size, LEAST_CELLS, MOST_CELLS)
-    size = np.prod(area.high - area.low) * len(modes) * kind.usual.sectors
+    size = np.prod(area.high - area.low) * len(modes) * kind.sectors
     cell = max(area.cell, float(np.sqrt(size / cells)))
     wide = replace(kind, cell=cell)
     lattice = area.lattice(wide, 0.0 if np.isnan(goal.heading) else goal.heading, start, goal, len(modes))
@@ -85,25 +88,16 @@ def costs_of(kind: Kind, area: Area, body: RobotBody, start: Floats, goal: Goal,
     headings = [goal.heading] if not np.isnan(goal.heading) else (np.arange(kind.sectors) * kind.sector).tolist()
     ends = range(len(modes) if bent else 1)
     goals = np.array([[goal.x, goal.y, heading, mode] for mode in ends for heading in headings])
-    around = _around(goal, headings) if kind.finest and not kind.model.trailers else np.zeros((0, 4))
     count = lattice.cells
     steps = np.full(count, np.inf, np.float32)
     far = fill_costs(
-        body, back, lattice, goals, around, start, pace, steps, np.empty((count, 4)), Heap.of(2 * count + 512),
+        body, back, lattice, goals, start, pace, steps, np.empty((count, 4)), Heap.of(2 * count + 512),
         modes.index(kind.start), np.zeros(buffer_size(body.footprints), np.float32),
     )  # fmt: skip
     if far == np.inf:
         # Cells are coarse: even where no chain of them leads from the start to the goal, a path may do so.
         far, pace = float(steps[steps < np.inf].max(initial=0)), 0.0
     return Costs(lattice, steps, far, pace, (float(start[0]), float(start[1])))
-
-
-def _around(goal: Goal, headings: list[float]) -> Floats:
-    """``(., 4)`` poses, at rest, at which a robot without trailers has arrived too."""
-    turns = [0.0] if np.isnan(goal.heading) else (goal.tolerance * WITHIN).tolist()
-    places = [(x, y) for x, y in product((goal.radius * WITHIN).tolist(), repeat=2) if x * x + y * y < goal.radius**2]
-    poses = product(places, headings, turns)
-    return np.array([[goal.x + x, goal.y + y, heading + turn, 0.0] for (x, y), heading, turn in poses])
 
 
 class Heap(NamedTuple):
@@ -196,7 +190,7 @@ def _spread(
 
 @cached_kernel(**OPTIONS)
 def fill_costs(
-    body: RobotBody, primitives: Primitives, lattice: PoseLattice, goals: Floats, around: Floats, start: Floats,
+    body: RobotBody, primitives: Primitives, lattice: PoseLattice, goals: Floats, start: Floats,
     pace: float, costs: FloatArray, poses: Floats, heap: Heap, mode: int, buffer: FloatArray,
 ) -> float:  # fmt: skip
     """Spread costs backwards from the goals over all poses that a robot may pass on its way there, detours included.
@@ -206,7 +200,6 @@ def fill_costs(
         primitives: What it can do, backwards in time.
         lattice: Cells and sectors.
         goals: ``(., 4)`` poses and modes.
-        around: The same, of which those count that are free.
         start: ``(3,)`` pose, towards which costs are spread first.
         pace: Steps that a metre takes at least.
         costs: ``(cells,)`` steps to the goal, filled; infinite to begin with, and beyond what was reached.
@@ -225,11 +218,6 @@ def fill_costs(
         cell = cell_of(lattice, goals[number, 0], goals[number, 1], goals[number, 2], int(goals[number, 3]))
         if cell >= 0 and costs[cell] > 0:
             costs[cell], poses[cell] = 0, goals[number]
-            push(heap, 0.0, cell)
-    for row in around:
-        cell = cell_of(lattice, row[0], row[1], row[2], int(row[3]))
-        if cell >= 0 and costs[cell] > 0 and is_free(body, (row[0], row[1], row[2], 0.0, 0.0, 0.0), buffer):
-            costs[cell], poses[cell] = 0, row
             push(heap, 0.0, cell)
     most, last = np.inf, 0.0
     while 0 < heap.filled[0] < heap.value.shape[0] - 256 and last <= most:

@@ -7,8 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from d4orm_planners.manoeuvres.costs import Costs
-from d4orm_planners.manoeuvres.lattice import PoseLattice
+from d4orm_planners.manoeuvres.costs import unknown_costs
 from d4orm_planners.manoeuvres.primitives import seen_from_first, table
 from d4orm_planners.manoeuvres.robots import Robot
 from d4orm_planners.manoeuvres.search import Motion
@@ -25,12 +24,6 @@ def on_fixed_path(robot: Robot, motion: Motion) -> Robot:
         speed = np.append(np.full(end - first - 1, np.inf), 0.0)
         rows.append((modes - 1 - number, modes - 2 - number, poses, speed, controls))
     primitives, lattice = table(rows, np.ones(modes, bool)), robot.task.lattice._replace(modes=modes)
-    task = robot.task._replace(primitives=primitives, lattice=lattice, costs=_unknown(lattice))
+    # There are too few moves for the order to matter.
+    task = robot.task._replace(primitives=primitives, lattice=lattice, costs=unknown_costs(lattice))
     return replace(robot, task=task, mode=modes - 1)
-
-
-def _unknown(lattice: PoseLattice) -> Costs:
-    """Costs of which none is known: there are too few moves for the order to matter."""
-    nowhere = lattice.usual._replace(size=(0, 0))
-    empty = PoseLattice(nowhere, lattice.heading, lattice.modes, (nowhere, nowhere))
-    return Costs(empty, np.zeros(1, np.float32), 0.0, 0.0, (0.0, 0.0))

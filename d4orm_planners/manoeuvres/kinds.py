@@ -8,7 +8,7 @@ from math import ceil, pi, sqrt
 import numpy as np
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import ACCELERATION, PYTHON_OPS, SPEED, Model, TimeStep
 
@@ -44,8 +44,8 @@ class Kind:
     dt: float  #: Time step [s]
     cell: float  #: Distance that should be told apart [m]
     start: Mode  #: Mode that the robot starts in
-    stops: bool = False  #: Whether it has moves from rest to rest only
-    finest: float = 0.0  #: The same near to its start and its goal, where it has shorter moves besides; zero for none
+    #: The same near to its start and its goal, where it has shorter moves besides, all from rest to rest; zero for none
+    finest: float = 0.0
 
     @property
     def model(self) -> Model:
@@ -61,6 +61,13 @@ class Kind:
     def usual(self) -> Kind:
         """The same with usual cells everywhere."""
         return replace(self, finest=0.0)
+
+    @property
+    def parts(self) -> tuple[Kind, ...]:
+        """Those whose moves it has: usual ones, and with finer cells those that fit these and some in between."""
+        if not self.finest:
+            return (self,)
+        return self.usual, self.careful, replace(self, finest=sqrt(self.cell * self.finest)).careful
 
     @property
     def careful(self) -> Kind:
@@ -102,7 +109,7 @@ class Kind:
         count = self.steps(sqrt(length / acceleration), 1.0)
         return count, length / (count * self.dt)
 
-    def states(self, state: State, controls: FloatArray) -> list[State]:
+    def states(self, state: State, controls: FloatArray | Floats) -> list[State]:
         """The ``n + 1`` states under ``(n, m)`` controls, by the model's own integration."""
         h = TimeStep(self.dt, self.dt / 2, self.dt / 3, self.dt / 6)
         states = [state]

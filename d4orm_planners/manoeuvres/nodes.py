@@ -79,6 +79,7 @@ class Task(NamedTuple):
     weight: float  #: Times that these count more than the steps behind
     departure_interval: int  #: Steps between departures that are tried
     horizon: int  #: Last step
+    in_line: bool  #: Whether wheels have to be straight and trailers in line at the goal
     number: int  #: Of the search, different in each that writes to the same nodes
 
 

@@ -52,9 +52,8 @@ class Primitives(NamedTuple):
 def primitives_of(kind: Kind) -> tuple[Primitives, Primitives, tuple[Mode, ...]]:
     """The primitives of a robot, the same backwards in time, and their modes; the first one is that of rest."""
     # Longer ones, of a robot that is next to unable to reverse or to turn, have no room in a search.
-    kinds = (kind.usual, kind.careful) if kind.finest else (kind,)
-    moves = [move for own in kinds for move in MOVES[kind.name](own) if len(move[2]) <= MAX_STEPS]
-    if kind.stops:
+    moves = [move for own in kind.parts for move in MOVES[kind.name](own) if len(move[2]) <= MAX_STEPS]
+    if kind.finest:
         moves = [move for move in moves if _stands(kind, move[0]) and _stands(kind, move[1])]
     modes = tuple(dict.fromkeys(mode for before, after, _ in moves for mode in (before, after)))
     modes = tuple(sorted(modes, key=lambda mode: sum(map(abs, mode))))

@@ -52,7 +52,6 @@ class ManoeuvreScene(NamedTuple):
     arrays: ProblemArrays
     extra: float  #: Distance kept from everything [m]
     bent: BoolArray  #: ``(K,)`` whether trailers have to be in a bend at the robot's goal
-    stops: bool = False  #: Whether robots stop after every move
     finest: float = 0.0  #: Size of cells near to starts and goals, zero for the usual one [m]
 
     @property
@@ -60,10 +59,13 @@ class ManoeuvreScene(NamedTuple):
         """Distance beyond which two robots do not matter to each other in a step [m]."""
         return 2 * float(self.problem.team.radius.max()) + self.extra + 2 * self.problem.stride
 
-    def with_cells(self, share: float, stops: bool = False, near: float = 0.0) -> ManoeuvreScene:
-        """The same with cells of other sizes, shares of this one's, or with robots that stop after every move."""
-        cell = self.area.cell
-        return self._replace(area=self.area._replace(cell=share * cell), stops=stops, finest=near * cell)
+    def with_cells(self, share: float) -> ManoeuvreScene:
+        """The same with cells of another size, a share of this one's."""
+        return self._replace(area=self.area._replace(cell=share * self.area.cell))
+
+    def with_finer_cells(self, share: float) -> ManoeuvreScene:
+        """The same with cells near to starts and goals of another size, a share of the others'."""
+        return self._replace(finest=share * self.area.cell)
 
     def body(self, robot: int) -> RobotBody:
         """A robot among the obstacles."""
@@ -149,37 +151,40 @@ class Robot:
     """A robot, as the search reads it."""
 
     model: Model
+    kind: Kind  #: On which its primitives depend
     start: Floats  #: ``(6,)`` pose
     mode: int  #: That it starts in
     task: Task  #: What a search for its motion is told
 
 
-def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:
-    """Prepare the search for a robot of a team; ``None`` if its trailers cannot be brought in line from the start."""
+def make_robot(scene: ManoeuvreScene, number: int, goal: Goal | None = None) -> Robot | None:
+    """Prepare the search for a robot of a team, to its own goal or another one with trailers in line; ``None`` if its
+    trailers cannot be brought in line from the start.
+    """
     problem, area, body = scene.problem, scene.area, scene.body(number)
     model = problem.team.robot_models[number]
     state = problem.start[number, : model.state_size].astype(np.float64).tolist()
     limits = problem.team.limits[number, : len(model.limit_names)].astype(np.float64).tolist()
-    kind = Kind(
-        model.name, tuple(limits), problem.dt, area.cell, tuple(state[_extra(model) :]), scene.stops, scene.finest
-    )  # fmt: skip
+    begin = tuple(state[_extra(model) :])
+    kind = Kind(model.name, tuple(limits), problem.dt, area.cell, begin, scene.finest)
     primitives, _, modes = primitives_of(kind)
     if kind.start not in modes:
         return None
-    start, goal, last = np.zeros(POSE_SIZE), make_goal(problem, number), _limits(kind)
+    start, goal, last = np.zeros(POSE_SIZE), goal or make_goal(problem, number), _limits(kind)
     start[: _extra(model)] = state[: _extra(model)]
     start[3 : 3 + len(model.trailers)] = state[3 : 3 + len(model.trailers)]
     lattice = area.lattice(kind, float(start[2]), start, goal, len(modes))
-    wanted = tuple(np.nan_to_num(problem.goal_hitches[number, : len(model.trailers)].astype(np.float64)).tolist())
+    wanted = tuple(np.nan_to_num(goal.hitches[: len(model.trailers)]).tolist())
     hitches = wanted if any(wanted) else None
     bent = bool(scene.bent[number]) or hitches is not None
     costs = Costs(lattice, np.zeros(0, np.float32), np.inf, 0.0, (0.0, 0.0))
-    if problem.world.num_obstacles or last.way in (NOWHERE, CURVING):
+    if scene.finest == 0 and (problem.world.num_obstacles or last.way in (NOWHERE, CURVING)):
         costs = costs_of(kind, area, body, start, goal, problem.num_robots, bent)
     curves = curves_of(kind.base, bent, hitches) if last.way == CURVING else NO_CURVES
     interval = max(1, round(DEPARTURE_INTERVAL * float(problem.team.radius.max()) / problem.stride))
-    task = Task(body, primitives, last, curves, goal, lattice, costs, WEIGHT, interval, problem.horizon, number=0)
-    return Robot(model, start, modes.index(kind.start), task)
+    in_line, horizon = last.way == CURVING and curves.last == 0, problem.horizon
+    task = Task(body, primitives, last, curves, goal, lattice, costs, WEIGHT, interval, horizon, in_line, number=0)
+    return Robot(model, kind, start, modes.index(kind.start), task)
 
 
 def _limits(kind: Kind) -> Limits:

@@ -190,10 +190,8 @@ def find_motion(task: Task, traffic: Traffic, nodes: Nodes, start: Floats, mode:
         cell = cell_of(task.lattice, x, y, heading, nodes.mode[node])
         if is_dominated(nodes, slot_of(nodes, cell, task.number), task.number, node, nodes.time[node] - 1):
             continue
-        ends = task.primitives.rests[nodes.mode[node]] and nodes.until[node] == NEVER
-        if task.limits.way == CURVING and task.curves.last == 0:
-            ends = ends and nodes.mode[node] == 0
-        if ends and reaches(task.goal, nodes.pose[node], 0.0, 1.0):
+        ends = task.primitives.rests[nodes.mode[node]] and (nodes.mode[node] == 0 or not task.in_line)
+        if ends and nodes.until[node] == NEVER and reaches(task.goal, nodes.pose[node], 0.0, 1.0):
             return node
         _snaps(task, nodes, traffic, node)
         begin, end = task.primitives.begin[nodes.mode[node]], task.primitives.begin[nodes.mode[node] + 1]

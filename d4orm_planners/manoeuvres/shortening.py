@@ -43,26 +43,39 @@ def shortened(
     random: np.random.Generator,
 ) -> Motion:  # fmt: skip
     """A motion from a state that takes fewer steps, or the motion itself; it meets nobody if that does not."""
-    model, controls, poses, failures = robot.model, motion.controls.astype(np.float64), motion.poses, 0
-    space, leave = GapSpace.of(motion.steps, model.state_size, model.control_size), int(SHARE * motion.steps)
-    space.states[0], close_gap = start[: model.state_size], gap_closer(model.name)
+    controls, best, failures = motion.controls.astype(np.float64), motion, 0
+    leave = int(SHARE * motion.steps)
     for _ in range(TRIES if motion.steps <= MAX_STEPS else 0):
-        leave, steps = max(1, min(leave, len(controls) - 1)), 0
+        leave = max(1, min(leave, len(controls) - 1))
         if failures == FAILURES or len(controls) < 2:
             break
         first = int(random.integers(len(controls) - leave))
         fewer = np.concatenate([controls[:first], controls[first + leave :]])
-        if close_gap(ends, fewer, first, space):
-            _write_poses(model, ends, space.states[: len(fewer) + 1], nodes.swept)
-            steps = steps_if_clear(robot.task, traffic, nodes, first, len(fewer))
-        if steps:
-            controls, poses = fewer[:steps], nodes.swept[: steps + 1, :POSE_SIZE].astype(np.float32)
+        shorter = closed(robot, start, ends, fewer, first, traffic, nodes)
+        if shorter is not None:
+            controls, best = fewer[: shorter.steps], shorter
             leave, failures = 2 * leave, 0
         else:
             leave, failures = leave // 2, failures + (leave == 1)
-    if len(controls) == motion.steps:
-        return motion
-    return Motion(poses, controls.astype(np.float32), np.array([0, len(controls)]))
+    return best
+
+
+def closed(
+    robot: Robot, start: FloatArray, ends: Ends, controls: Floats, first: int, traffic: Traffic, nodes: Nodes
+) -> Motion | None:
+    """The motion from a state under controls ``(T, m)``, which are changed from a step on so that it ends at the goal;
+    ``None`` if they cannot be, or it is not clear of everything.
+    """
+    model, steps = robot.model, 0
+    space = GapSpace.of(len(controls), model.state_size, model.control_size)
+    space.states[0] = start[: model.state_size]
+    if gap_closer(model.name)(ends, controls, first, space):
+        _write_poses(model, ends, space.states, nodes.swept)
+        steps = steps_if_clear(robot.task, traffic, nodes, first, len(controls))
+    if steps == 0:
+        return None
+    poses = nodes.swept[: steps + 1, :POSE_SIZE].astype(np.float32)
+    return Motion(poses, controls[:steps].astype(np.float32), np.array([0, steps]))
 
 
 def _write_poses(model: Model, ends: Ends, states: Floats, swept: Floats) -> None:

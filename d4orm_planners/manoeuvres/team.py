@@ -4,7 +4,7 @@ robot after another among the others, and replanned for a few at a time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from itertools import count
 
 import numpy as np
@@ -21,6 +21,7 @@ from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 from d4orm_planners.manoeuvres.robots import ManoeuvreScene, Robot, make_robot, scene_of
 from d4orm_planners.manoeuvres.search import PAUSED, Motion, find_motion, motion_to
 from d4orm_planners.manoeuvres.shortening import shortened
+from d4orm_planners.manoeuvres.tight_places import motion_by_the_open
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meets_nobody, traffic_of
 from d4orm_planners.mapf.lns import Odds
 from d4orm_planners.tracking.steering import advanced
@@ -32,21 +33,9 @@ FIRST_NODES = 400_000
 team it is quicker to change others' motions."""
 DETOUR_NODES = MAX_NODES // 5
 """Nodes of which one is drawn for a robot to go to first."""
-CELLS = (
-    (1.0, MAX_NODES, False, 0.0),
-    (0.8, MAX_NODES, False, 0.0),
-    (0.6, MAX_NODES, False, 0.0),
-    (1.0, MAX_NODES, True, 0.0),
-    (0.8, MAX_NODES, True, 0.0),
-    (0.6, MAX_NODES, True, 0.0),
-    (1.0, MAX_NODES, True, 0.125),
-    (1.0, MAX_NODES, True, 0.1),
-    (1.0, MAX_NODES, True, 0.08),
-    (0.25, 10 * MAX_NODES, False, 0.0),
-)
-"""Sizes of cells that are tried in turn for a robot alone, as shares of the usual one; nodes; whether it stops after
-every move, which leaves more of them to a car that parks; and the sizes near to its start and its goal, if they are
-others. Whether poses that count as one leave a way through a tight place is chance."""
+CELLS = (1.0, 0.8, 0.6)
+"""Sizes of cells that are tried in turn for a robot alone, as shares of the usual one: whether poses that count as one
+leave a way through a tight place is chance."""
 
 
 class TeamMotions:
@@ -78,28 +67,26 @@ class TeamMotions:
         self.late = self.detours = False
         still = np.zeros((size, problem.control_size), np.float32)
         self._rests = (advanced(problem, problem.start, still) == problem.start).all(axis=1)
-        nobody, room = self._traffic((), {}), MAX_NODES
+        nobody = self._traffic((), {})
 
         def find_alone(part: IntArray) -> None:
-            nonlocal room
-            nodes, searches = self._room_for_nodes(MAX_NODES), count(1)
+            nodes, searches = self._room_for_nodes(), count(1)
             for robot in range(part[0], part[1]):
-                for share, most, stops, near in CELLS:
-                    if stops and not near and self.robots[robot].model.first_order:
-                        continue
-                    if share < 1.0 or stops:
-                        other = scene.with_cells(share, stops, near)
-                        self.robots[robot] = make_robot(other, robot) or self.robots[robot]
-                    if most > len(nodes.mode):
-                        nodes, room = self._room_for_nodes(most), most
-                    self.alone[robot] = self._search(robot, nobody, nodes, next(searches), most)
+                usual = self.robots[robot]
+                for share in CELLS:
+                    if share < 1.0:
+                        self.robots[robot] = make_robot(scene.with_cells(share), robot) or usual
+                    self.alone[robot] = self._search(robot, nobody, nodes, next(searches), MAX_NODES)
                     if self.alone[robot] is not None or should_stop():
                         break
                 else:
+                    self.robots[robot] = usual
+                    self.alone[robot] = self._by_the_open(scene, robot, nobody, nodes, searches)
+                if self.alone[robot] is None:
                     return  # nor will the team have any
 
         Threads(available_cores()).over(size, find_alone)
-        self._nodes, self._searches = self._room_for_nodes(room), size
+        self._nodes, self._searches = self._room_for_nodes(), size
 
     @classmethod
     def prepared(cls, problem: Problem, should_stop: Callable[[], bool]) -> TeamMotions | None:
@@ -237,8 +224,8 @@ class TeamMotions:
         poses = np.ascontiguousarray(self._poses[:, since:])
         return traffic_of(poses, last, gone, self._area.low, self._area.high, self._interaction_range)
 
-    def _room_for_nodes(self, most: int) -> Nodes:
-        return Nodes.of(most, buffer_size(self.problem.team.all_footprint_arrays))
+    def _room_for_nodes(self) -> Nodes:
+        return Nodes.of(MAX_NODES, buffer_size(self.problem.team.all_footprint_arrays))
 
     def _find(self, number: int, traffic: Traffic, delay: int) -> Motion | None:
         """A robot's motion among others: that which it would take alone, later by some steps, or else one that is
@@ -258,6 +245,16 @@ class TeamMotions:
             self._searches += 1
             motion = self._search(number, traffic, self._nodes, self._searches, most, fixed)
         return motion
+
+    def _by_the_open(
+        self, scene: ManoeuvreScene, number: int, nobody: Traffic, nodes: Nodes, searches: Iterator[int]
+    ) -> Motion | None:
+        """A robot's motion if there were nobody else, out of and into tight places."""
+
+        def find(robot: Robot, most: int) -> Motion | None:
+            return self._search(number, nobody, nodes, next(searches), most, robot)
+
+        return motion_by_the_open(scene, self.robots[number], nobody, nodes, find)
 
     def _search(
         self, number: int, traffic: Traffic, nodes: Nodes, search: int, most: int, instead: Robot | None = None

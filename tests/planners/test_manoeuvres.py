@@ -84,7 +84,7 @@ def test_a_place_that_leads_on_from_beside_the_goal_only(model: str) -> None:
 def test_searches_in_the_same_nodes_have_numbers_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[int, int]] = []
 
-    def search(self: TeamMotions, number: int, traffic: Any, nodes: Any, search: int, most: int) -> None:
+    def search(self: TeamMotions, number: int, traffic: Any, nodes: Any, search: int, *_: Any) -> None:
         seen.append((id(nodes.marks), search))
 
     monkeypatch.setattr(TeamMotions, "_search", search)
@@ -275,6 +275,22 @@ def test_a_car_that_stops_to_steer_parks_in_a_gap_hardly_longer_than_itself() ->
     world = World(boxes=[[-3, -1, -0.5, -0.4], [0.5, -1, 3, -0.4], [-3, -1.2, 3, -1]], lower=(-3, -1.2), upper=(3, 1.5))
     team = Team(("car",), footprint=Box(0.6, 0.3))
     solved(Problem(team, [[-2, 0, 0, 0, 0]], [[0, -0.7]], world, horizon=300, goal_heading=0.0))
+
+
+@pytest.mark.parametrize("model", ["unicycle", "car_first_order", slow("car")])
+@pytest.mark.parametrize("kerb", [True, False])
+def test_a_robot_parks_in_a_gap_of_its_length_and_a_third(model: str, kerb: bool) -> None:
+    """The usual search runs out of nodes in front of it."""
+    low = 0.0 if kerb else 0.8
+    world = World(boxes=[[1.0, low, 1.61, low + 0.4], [2.39, low, 3.0, low + 0.4]], lower=[0, 0], upper=[4, 2.5])
+    team = Team((model,), footprint=Box(0.6, 0.3))
+    start = [[0.7, 1.7, 0.3, *[0.0] * (team.state_size - 3)]]
+    solved(
+        Problem(
+            team, start, [[2.0, low + 0.2]], world, horizon=1500, margin=0.02, goal_radius=0.04, goal_heading=0.0,
+            goal_heading_tolerance=0.1,
+        )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("model", ["car", "differential_drive"])
