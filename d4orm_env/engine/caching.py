@@ -35,7 +35,7 @@ from d4orm_env.engine.kernel_files import KernelFiles, ShippedFiles, Turn, shipp
 
 P = ParamSpec("P")
 R_co = TypeVar("R_co", covariant=True)
-_NAMING = "structs by their fields, parts by their kernels"
+_NAMING = "structs by reference, named by their fields, parts by their kernels"
 """Rule by which names in kernels differ; kernels named by another must not be loaded beside these."""
 _ROOM = 2**24
 """Bytes that all kernels of the package take, more or less."""

@@ -21,6 +21,8 @@ from numba.core.registry import cpu_target
 from numba.core.targetconfig import TargetConfig
 from numba.core.transforms import canonicalize_cfg
 
+from d4orm_env.engine.borrowing import by_reference
+
 
 class _PartLibrary(JITCodeLibrary):
     """Code of a function that only kernels call, to be linked into theirs and optimised there.
@@ -120,9 +122,13 @@ class KernelCompiler(compiler.Compiler):
     """numba's compiler for a kernel."""
 
     def compile_extra(self, func: Callable[..., object]) -> Any:
-        """Compile a kernel."""
+        """Compile a kernel, which takes structs by reference from Python; its signature says nothing of it."""
+        kinds = self.state.args
+        if not self.state.flags.no_cpython_wrapper:
+            self.state.args = tuple(map(by_reference, kinds))
         with _replaced(*_parts_of_numba(), *_done_once(), *_done_sooner()):
-            return super().compile_extra(func)
+            made = super().compile_extra(func)
+        return made._replace(signature=made.signature.replace(args=kinds))
 
 
 Replacement: TypeAlias = tuple[Any, str, object]

@@ -14,7 +14,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
-from d4orm_env.engine.borrowing import borrow
+from d4orm_env.engine.borrowing import borrow, by_reference
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, WITHOUT_ARRAYS, ZERO, aligned_zeros, compiled, inlined
 from d4orm_env.engine.ray_shapes import is_blocked
@@ -55,8 +55,10 @@ class ObservationSpec(NamedTuple):
 
 
 _ROW, _ROWS = numba.float32[::1], numba.float32[:, ::1]
-SENSED_TYPES = numba.types.NamedTuple(
-    (_ROWS, _ROWS, _ROW, _ROWS, _ROW, numba.boolean[::1], _ROWS, _ROWS, _ROWS), observation.Sensed
+SENSED_TYPES = by_reference(
+    numba.types.NamedTuple(
+        (_ROWS, _ROWS, _ROW, _ROWS, _ROW, numba.boolean[::1], _ROWS, _ROWS, _ROWS), observation.Sensed
+    )
 )
 """As numba knows what is sensed."""
 

@@ -16,6 +16,7 @@ from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.models import MODELS, names_of_codes
 from d4orm_env.engine import elementary
+from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled, inlined
 from d4orm_env.engine.convex_cores import place_body
@@ -231,6 +232,7 @@ def cast_rays(
     Robots are in ``state`` ``(B, K, n)``, among ``bodies`` ``(B, N, 5)``: position, velocity and radius of moving
     obstacles. ``part`` is the first tile of worlds and the one after the last.
     """
+    s = borrow(s)
     num_rays, fixed = s.directions.shape[0], s.boxes.shape[0] + s.triangles.shape[0]
     mobile = fixed + _count_bodies(s.footprints, state.shape[1])
     things = CHUNK * -(-(mobile + bodies.shape[1]) // CHUNK)

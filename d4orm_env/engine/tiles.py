@@ -25,6 +25,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import Model, TimeStep
+from d4orm_env.engine.borrowing import by_reference
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS, cosine, sine
@@ -130,7 +131,7 @@ class TeamBoxes(NamedTuple):
     order: IntArray
 
 
-BOX_TYPES = types.NamedTuple((float32[:, :, ::1], int64[::1]), TeamBoxes)
+BOX_TYPES = by_reference(types.NamedTuple((float32[:, :, ::1], int64[::1]), TeamBoxes))
 """As numba knows them."""
 
 

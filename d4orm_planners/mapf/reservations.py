@@ -251,13 +251,18 @@ class Reservations(NamedTuple):
 
 
 @cached_kernel(variant="reservations", **OPTIONS)
-def make_reservations(
+def _reserve(
     roadmap: Roadmap, bodies: RobotArrays, others: Others, k: Whole, latest: int, stays: bool
-) -> Reservations:
-    """The reservations for paths of a robot that end by a step, at a goal where it stays or not."""
+) -> tuple[Buckets, Intervals, Whole]:
     goal = bodies.goals[k]
     # Nobody may come near its goal once it stands there for good.
     dock = last_visit(others, goal) if stays else np.int64(-1)
     buckets = sort_boxes(others, roadmap.flat, roadmap.lengths.max() / 2, latest // BLOCK + 1)
-    safe = free_intervals(others, roadmap.starts[k], roadmap.nodes.shape[0], latest + 1)
-    return Reservations(others, buckets, safe, dock)
+    return buckets, free_intervals(others, roadmap.starts[k], roadmap.nodes.shape[0], latest + 1), dock
+
+
+def make_reservations(
+    roadmap: Roadmap, bodies: RobotArrays, others: Others, k: Whole, latest: int, stays: bool
+) -> Reservations:
+    """The reservations for paths of a robot that end by a step, at a goal where it stays or not."""
+    return Reservations(others, *_reserve(roadmap, bodies, others, k, latest, stays))
