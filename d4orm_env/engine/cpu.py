@@ -38,7 +38,7 @@ from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.tiles import BOX_TYPES, STRIDE, allocate_boxes, pose_rows, robot_unit
 from d4orm_env.engine.types import ObservationInputs, StepResult, WorldBatch, checked_controls
 from d4orm_env.engine.units import Call, Types, address_of, compile_together, path_of
-from d4orm_env.engine.world_tiles import CONTACT_TYPES, WorldArrays, check_contacts
+from d4orm_env.engine.world_tiles import CONTACT_TYPES, WorldArrays, check_contacts, mark_static
 
 SHARED = 2**15  #: Steps of all robots together from which on threads share the checks of a rollout
 
@@ -57,6 +57,8 @@ def roll_out_of_codes(codes: bytes) -> RollOut:
 _UNITS: dict[tuple[object, ...], IntArray] = {}
 """By what decides what they are, up to :data:`_MOST_UNITS`."""
 _MOST_UNITS = 256
+_OPEN = {np.array([[-np.inf] * d, [np.inf] * d], np.float32).tobytes() for d in (2, 3)}
+"""Bounds that are none."""
 
 
 def _units_of(arrays: ProblemArrays, view: ObservationSpec | None, caller: Any, *arguments: object) -> IntArray:
@@ -65,22 +67,25 @@ def _units_of(arrays: ProblemArrays, view: ObservationSpec | None, caller: Any, 
     The first time they are compiled, together with the kernel if it is a module's. These are its arguments before them.
     """
     sight = view is not None and view.line_of_sight
-    key = caller, arrays.model_codes.tobytes(), arrays.footprints is None, arrays.turns_at_goals is None, sight
+    closed = len(arrays.grid.clearance) > 0 or arrays.bounds.tobytes() not in _OPEN
+    key = caller, arrays.model_codes.tobytes(), arrays.footprints is None, arrays.turns_at_goals is None, closed, sight
     if key not in _UNITS:
         if len(_UNITS) >= _MOST_UNITS:
             _UNITS.clear()
-        units = _units(arrays, view)
+        units = _units(arrays, closed, view)
         kinds = (*map(numba.typeof, arguments), numba.int64[:, ::1])
-        compile_together([*dict.fromkeys(units), (path_of(caller), kinds)] if caller else [])
-        _UNITS[key] = np.array([address_of(*call) for call in units])
+        compile_together([*dict.fromkeys(filter(None, units)), (path_of(caller), kinds)] if caller else [])
+        _UNITS[key] = np.array([address_of(*call) if call else (0, 0) for call in units])
     return _UNITS[key]
 
 
-def _units(arrays: ProblemArrays, view: ObservationSpec | None) -> list[Call]:
-    """The units of kernels for this problem."""
+def _units(arrays: ProblemArrays, closed: bool, view: ObservationSpec | None) -> list[Call | None]:
+    """The units of kernels for this problem, ``None`` for one that is not called."""
     problem, rows, lines = borrowed(arrays), numba.float32[:, :, ::1], numba.float32[::1]
-    kinds: Types = problem, CONTACT_TYPES, numba.int64, lines, BOX_TYPES, numba.uint64[:, ::1]
-    units = [(path_of(check_contacts), kinds)]
+    near, addresses = numba.uint64[:, ::1], numba.int64[:, ::1]
+    kinds: Types = problem, addresses, CONTACT_TYPES, numba.int64, lines, BOX_TYPES, near
+    units: list[Call | None] = [(path_of(check_contacts), kinds)]
+    units.append((path_of(mark_static), (problem, numba.uint64, numba.float32, lines, near)) if closed else None)
     if view is not None:
         table = numba.float32[:, ::1]
         kinds = problem, table, numba.float32, borrowed(view), SENSED_TYPES, table

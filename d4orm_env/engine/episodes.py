@@ -168,7 +168,7 @@ def advance_worlds(
         measure_goal_distance(num_robots, dimension, w)
         if moving:
             _move_tile(arrays, batch, orders, first, count, w, motion, units)
-        call_check_contacts(units[CONTACTS], arrays, contacts, first, w, scratch.boxes, scratch.near)
+        call_check_contacts(units[CONTACTS], arrays, units, contacts, first, w, scratch.boxes, scratch.near)
         if out.shape[0] > 0:
             read_motion(arrays, units, count, w, motion)
         for b in range(first, first + count):
@@ -255,6 +255,6 @@ def roll_out_kernel(names: tuple[str, ...]) -> RollOut:
         for tile in range(tiles[0], tiles[1]):
             load(moments, tile * TILE, w)
             measure_goal_distance(num_robots, dimension, w)
-            call_check_contacts(units[CONTACTS], arrays, contacts, tile * TILE, w, boxes, near)
+            call_check_contacts(units[CONTACTS], arrays, units, contacts, tile * TILE, w, boxes, near)
 
     return roll_out

@@ -8,7 +8,7 @@ import numpy as np
 from numba import boolean, float32, types
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Whole
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, Whole
 from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
@@ -35,7 +35,7 @@ from d4orm_env.engine.tiles import (
     place_team,
 )
 from d4orm_env.engine.types import ObservationInputs, WorldBatch
-from d4orm_env.engine.units import UNIT, caller
+from d4orm_env.engine.units import OBSTACLES, UNIT, caller
 
 
 class WorldArrays(NamedTuple):
@@ -122,11 +122,15 @@ def _meets_body(
     )  # fmt: skip
 
 
-@inlined
-def _mark_static(
+@cached_kernel(**UNIT)
+def mark_static(
     arrays: ProblemArrays, lanes: np.uint64, extra: np.float32, w: FloatArray, near: NDArray[np.uint64]
 ) -> None:
-    """Flag every robot closer to an obstacle or the bounds than its radius plus ``extra``, in some lanes."""
+    """Flag every robot closer to an obstacle or the bounds than its radius plus ``extra``, in some lanes.
+
+    A unit of its own, which is not compiled until a problem has obstacles or bounds.
+    """
+    use_wide_registers()
     num_robots, f = arrays.radius.shape[0], arrays.footprints
     for k in range(num_robots):
         robot = w[k * STRIDE : (k + 1) * STRIDE]
@@ -134,6 +138,9 @@ def _mark_static(
         touch = lanes & obstacles.near_obstacles(arrays, arrays.wall_radius[k] + extra, positions, buffer)
         touch = refine_static(f, arrays, k, touch, extra, positions, w, POSE * TILE, num_robots * STRIDE, buffer)
         near[k, OBSTACLE] |= touch
+
+
+_call_mark_static = caller(5)
 
 
 @inlined
@@ -166,6 +173,7 @@ def _bit(mask: np.uint64, s: int) -> np.uint64:
 @cached_kernel(**UNIT)
 def check_contacts(
     arrays: ProblemArrays,
+    units: IntArray,
     worlds: Contacts,
     first: int,
     w: FloatArray,
@@ -174,10 +182,12 @@ def check_contacts(
 ) -> None:
     """Complete the flags of contacts and margin violations of the worlds of a tile, then compute the rewards.
 
-    ``boxes`` of :func:`~d4orm_env.engine.tiles.allocate_boxes` are overwritten, and so is ``near`` ``(K, 3)``.
+    It calls one of ``units``, their addresses. ``boxes`` of :func:`~d4orm_env.engine.tiles.allocate_boxes` are
+    overwritten, and so is ``near`` ``(K, 3)``.
     """
     use_wide_registers()
     num_robots, count = arrays.radius.shape[0], min(TILE, worlds.rewards.shape[0] - first)
+    closed = obstacles.is_closed(arrays)
     place_team(arrays.footprints, num_robots, w)
     enclose_team(count, w, boxes)
     for k in range(num_robots):
@@ -187,7 +197,8 @@ def check_contacts(
     for level in range(2):
         extra = ZERO if level == 0 else arrays.margin
         mark_pairs(arrays, lanes, extra, w, w[BUFFER * TILE : ROWS * TILE], boxes, near)
-        _mark_static(arrays, lanes, extra, w, near)
+        if closed:
+            _call_mark_static(units[OBSTACLES], arrays, lanes, extra, w, near)
         _mark_bodies(arrays, worlds.bodies, first, extra, w, near)
         flags = worlds.collided if level == 0 else worlds.violated
         for s in range(count):
@@ -206,5 +217,5 @@ def check_contacts(
             )  # fmt: skip
 
 
-call_check_contacts = caller(6)
+call_check_contacts = caller(7)
 """``(address, *arguments)``: call :func:`check_contacts` as a unit."""
