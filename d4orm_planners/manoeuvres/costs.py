@@ -217,7 +217,9 @@ def fill_costs(
     for number in range(goals.shape[0]):
         cell = cell_of(lattice, goals[number, 0], goals[number, 1], goals[number, 2], int(goals[number, 3]))
         if cell >= 0 and costs[cell] > 0:
-            costs[cell], poses[cell] = 0, goals[number]
+            costs[cell] = 0
+            for i in range(poses.shape[1]):  # numba takes a second to compile assignments of slices
+                poses[cell, i] = goals[number, i]
             push(heap, 0.0, cell)
     most, last = np.inf, 0.0
     while 0 < heap.filled[0] < heap.value.shape[0] - 256 and last <= most:
