@@ -108,7 +108,7 @@ def by_reference(kind: types.Type) -> types.Type:
 @intrinsic
 def _borrow(typing_context: TypingContext, struct: _Borrowed) -> Instructions:
     def generate(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]) -> Value:
-        kind = arguments[0].type.pointee
+        kind = context.get_value_type(struct.struct)
         address, size = cgutils.alloca_once(builder, kind), context.get_abi_sizeof(kind)
         cgutils.raw_memcpy(builder, address, arguments[0], ir.Constant(ir.IntType(64), size), 1)
         return address
