@@ -31,8 +31,8 @@ from d4orm_planners.manoeuvres.traffic import Traffic
 
 MAX_NODES, WAYS = 50_000, 3
 """Nodes of a search, and poses in the open that are tried."""
-FINER = 0.04
-"""Size of the cells near to start and goal, as a share of the usual one."""
+FINER = (0.04, 0.025)
+"""Sizes of the cells near to start and goal that are tried in turn, as shares of the usual one."""
 EXACT = 0.02
 """Share of the goal's tolerances within which a robot comes to a pose from which there is a way in, so that this is one
 from there too."""
@@ -57,23 +57,31 @@ def motion_by_the_open(
 
     ``find`` looks for a robot's motion in ``nodes``, in so many of them.
     """
+    for share in FINER:
+        careful = make_robot(scene.with_finer_cells(share), robot.task.body.robot)
+        if careful is None:
+            return None
+        for out, into in product(*_ways_out_and_in(scene, careful, nodes, find)):
+            motion = _joined(scene, robot, out, into, nobody, nodes, find)
+            if motion is not None:
+                return motion
+    return None
+
+
+def _ways_out_and_in(
+    scene: ManoeuvreScene, robot: Robot, nodes: Nodes, find: Callable[[Robot, int], object]
+) -> tuple[list[Way], list[Way | None]]:
+    """Ways out of the start, one of no steps if it is in the open, and into the goal, ``None`` for the usual ones."""
     task, outs = robot.task, [Way(robot.start, np.zeros((0, robot.model.control_size)))]
     ins: list[Way | None] = [None]
-    careful = make_robot(scene.with_finer_cells(FINER), task.body.robot)
-    if careful is None:
-        return None
     if not len(_in_the_open(scene, task.body, robot.start[None])):
-        find(_towards(careful, task.goal.x, task.goal.y), MAX_NODES)
-        outs = list(_ways(scene, careful.task, nodes))
+        find(_towards(robot, task.goal.x, task.goal.y), MAX_NODES)
+        outs = list(_ways(scene, task, nodes))
     if not (np.isnan(task.goal.heading) or scene.bent[task.body.robot] or np.nan_to_num(task.goal.hitches).any()):
-        back = _backwards(careful, _roomiest(scene.problem.world, task.goal))
+        back = _backwards(robot, _roomiest(scene.problem.world, task.goal))
         find(back, MAX_NODES)
         ins = list(_ways(scene, back.task, nodes, out=False))
-    for out, into in product(outs, ins):
-        motion = _joined(scene, robot, out, into, nobody, nodes, find)
-        if motion is not None:
-            return motion
-    return None
+    return outs, ins
 
 
 def _joined(
