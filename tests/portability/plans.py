@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d4orm_env import make_problem, navigation_v0
+from d4orm_env import Problem, Team, World, make_problem, navigation_v0
 from d4orm_env.disturbances import Disturbance, Intruder, Push
 from d4orm_env.footprints import Box, Footprint
+from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_planners import make_planner, make_policy, run_episode
 
 
@@ -24,12 +25,21 @@ class Case(NamedTuple):
 
     planner: str
     settings: dict[str, Any]
-    scenario: str
+    scenario: ScenarioLike
     arguments: dict[str, Any]
     max_iterations: int = 2
     disturbances: tuple[Disturbance[Any], ...] = ()
     footprint: Footprint | None = None
     """Of all robots, which then have to face along x at their goals."""
+
+
+def tight_gap(seed: int, num_robots: int, *, goal_speed: float) -> Problem:
+    """A car parks in a gap of 1.3 lengths."""
+    world = World(boxes=[[1.0, 0.0, 1.61, 0.4], [2.39, 0.0, 3.0, 0.4]], lower=[0, 0], upper=[4, 2])
+    return Problem(
+        Team(("car_first_order",), footprint=Box(0.6, 0.3)), [[0.7, 1.2, 0.3]], [[2.0, 0.2]], world, horizon=600,
+        margin=0.02, goal_radius=0.04, goal_speed=goal_speed, goal_heading=0.0, goal_heading_tolerance=0.1,
+    )  # fmt: skip
 
 
 CASES = {
@@ -60,6 +70,7 @@ CASES = {
     "manoeuvres of cars": Case(
         "hybrid", {}, "four_obstacles", {"num_robots": 4, "model": "car_first_order"}, footprint=Box(0.4, 0.2, 0.05)
     ),
+    "into a tight gap": Case("hybrid", {}, tight_gap, {"num_robots": 1}),
     "in space": Case("d4orm", {}, "sphere", {"num_robots": 8}),
     "in space with drag": Case("d4orm", {}, "sphere", {"num_robots": 4, "model": "holonomic3d_drag"}),
     "among walls": Case("hybrid", {"improve": True}, "rooms", {"num_robots": 8}, 3),
