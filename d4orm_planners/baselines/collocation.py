@@ -99,7 +99,8 @@ class TeamProgram:
         points = [self.casadi.DM(own) for own in states]
         found = {}
         for robot, body in self._encounters():
-            near = steps[np.asarray(self._gap(robot, body, points)).ravel() < self._min_gap(robot, body) + lookout]
+            gap = self._gap(robot, body, points).full()  # NumPy's conversion turns a Ctrl-C into a SystemError
+            near = steps[gap.ravel() < self._min_gap(robot, body) + lookout]
             if len(near):
                 found[robot, body] = near
         return found

@@ -190,7 +190,7 @@ def solve_program(
         return str(solver.stats()["return_status"])
 
     ended = _run_or_abandon(run, should_stop)
-    values = np.asarray(reached).ravel()
+    values = casadi.DM(reached).full().ravel()
     # IPOPT gives up where a function has no value; the guess is then the best there is.
     return program.unpacked(values) if np.isfinite(values).all() else guess, ended
 
