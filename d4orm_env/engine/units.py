@@ -99,8 +99,7 @@ def compile_together(calls: Sequence[Call]) -> None:
     if len(missing) < 2 or available_cores() < 2 or not sys.executable:
         return
     # What fails there, as with a model that was registered here, is compiled here.
-    command = [sys.executable, "-c", f"from {__name__} import _compile_given; _compile_given()"]
-    with suppress(OSError), subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL) as other:
+    with suppress(OSError), another_process(__name__, "compile_given()", stdin=subprocess.PIPE) as other:
         if other.stdin is not None:
             with other.stdin as pipe:
                 pickle.dump(missing[::-1], pipe)
@@ -108,6 +107,16 @@ def compile_together(calls: Sequence[Call]) -> None:
             kernel_of(path).compile(kinds)
 
 
-def _compile_given() -> None:
+def another_process(module: str, calls: str, **pipes: Any) -> subprocess.Popen[bytes]:
+    """Start a process that calls functions of a module.
+
+    It exits at once: Python would look through numba's objects for garbage, for a third of a second.
+    """
+    command = f"import os; from {module} import *; {calls}; os._exit(0)"
+    return subprocess.Popen([sys.executable, "-c", command], stderr=subprocess.DEVNULL, **pipes)
+
+
+def compile_given() -> None:
+    """Compile kernels that another process names."""
     for path, kinds in pickle.load(sys.stdin.buffer):
         kernel_of(path).compile(kinds)

@@ -18,7 +18,10 @@ def main() -> None:
         from d4orm_planners.cli.app import main as run
     except KeyboardInterrupt:
         sys.exit(130)
-    run()
+    try:
+        run()
+    finally:
+        gc.freeze()  # Python would look for garbage three times as it exits, for up to half a second
 
 
 @contextmanager

@@ -6,7 +6,6 @@ numba compiles one kernel at a time in a process, so that two processes do it in
 from __future__ import annotations
 
 import subprocess
-import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -17,6 +16,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.engine.caching import has_to_be_compiled
 from d4orm_env.engine.cpu import roll_out_of
 from d4orm_env.engine.threads import Threads
+from d4orm_env.engine.units import another_process
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.planner_registry import make_planner
@@ -76,7 +76,7 @@ def _has_walls(problem: Problem) -> bool:
 def in_another_process(call: str) -> subprocess.Popen[bytes]:
     """Start a process that calls functions of this module."""
     # What ends it, as Ctrl-C, ends this process too, which says so.
-    return subprocess.Popen([sys.executable, "-c", f"from {__name__} import *; {call}"], stderr=subprocess.DEVNULL)
+    return another_process(__name__, call)
 
 
 def roll_out_once(models: tuple[str, ...]) -> None:

@@ -88,6 +88,6 @@ def test_another_process_compiles_what_is_missing_from_the_end_on(monkeypatch: p
 def test_another_process_finds_the_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     given = pickle.dumps([(path_of(subtract), KINDS)])
     monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=io.BytesIO(given)))
-    units._compile_given()
+    units.compile_given()
     assert KINDS in subtract.signatures
     assert kernel_of(path_of(robot_unit, "velocity2d")) is robot_unit("velocity2d")
