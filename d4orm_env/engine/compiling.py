@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import FunctionType, ModuleType
 from typing import Any, Protocol, TypeVar
 
 import numba
@@ -49,32 +50,17 @@ INLINED = UNCOUNTED | {"forceinline": True}
 """Options for functions that take functions (a model, ``Ops``): inlining leaves no function pointer, so that numba can
 keep the kernels on disk. And for those that take a problem's arrays, which are a long argument to pass by value."""
 inlined: Compiler = numba.njit(nogil=True, **INLINED)
-for _function in (
-    formulas.norm_scale,
-    formulas.control_scale,
-    formulas.clip,
-    formulas.between,
-    formulas.stopping_speed,
-    formulas.share,
-    formulas.planar_approach,
-    formulas.first_order_approach,
-    formulas.limit_drive,
-    formulas.turn_towards,
-    robot_model.runge_kutta,
-    winding.unwound,
-    transition.advance,
-    transition.arrives,
-    transition.faces,
-    transition.absorbed,
-    collision.axis_gap,
-    collision.leaves,
-    collision.meets_edge,
-    collision.lies_left,
-    collision.meets_triangle,
-    transition.step_reward,
-):
-    # Compiled code may call these, which stay plain Python functions for all other callers.
-    register_jitable(**INLINED)(_function)
+
+
+def register(*modules: ModuleType) -> None:
+    """Let compiled code call all functions of modules, which stay plain Python functions for all other callers."""
+    for module in modules:
+        for function in vars(module).values():
+            if isinstance(function, FunctionType) and function.__module__ == module.__name__:
+                register_jitable(**INLINED)(function)
+
+
+register(formulas, robot_model, winding, transition, collision)
 
 to_fixed_tuple: Callable[..., tuple[np.float32, ...]] = ndarray.to_fixed_tuple
 """Its calls in compiled code lack the first argument, which type checkers cannot know."""

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from d4orm_env.core import observation
@@ -16,7 +15,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.engine.borrowing import borrow, by_reference
 from d4orm_env.engine.caching import cached_kernel
-from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, WITHOUT_ARRAYS, ZERO, aligned_zeros, compiled, inlined
+from d4orm_env.engine.compiling import ONE, OPTIONS, WITHOUT_ARRAYS, ZERO, aligned_zeros, compiled, inlined, register
 from d4orm_env.engine.ray_shapes import is_blocked
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.tiles import STATE, STRIDE, TeamBoxes, allocate_boxes, call_robot, pose_rows
@@ -24,22 +23,7 @@ from d4orm_env.engine.types import ObservationInputs
 from d4orm_env.engine.units import OBSERVATION, ROBOTS, UNIT, caller
 from d4orm_env.engine.world_tiles import load
 
-for _function in (
-    observation.observe_robot,
-    observation._see_itself,
-    observation._see_goal_heading,
-    observation._see_robots,
-    observation._see_obstacles,
-    observation.insert_nearest,
-    observation._comes_before,
-    observation._find_nearest_robots,
-    observation._find_nearest_obstacles,
-    observation._list_of,
-    observation._point_to,
-    observation._distance_to_box,
-    observation._gap_to_triangle,
-):
-    register_jitable(**INLINED)(_function)
+register(observation)
 
 
 class ObservationSpec(NamedTuple):

@@ -9,13 +9,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.engine import noise
 from d4orm_env.engine.caching import cached_kernel
-from d4orm_env.engine.compiling import INLINED, OPTIONS, compiled, inlined
+from d4orm_env.engine.compiling import OPTIONS, compiled, inlined, register
 from d4orm_env.engine.elementary import sqrt
 from d4orm_env.engine.noise import DRAWS
 from d4orm_env.engine.simd import copy_chunk, use_wide_registers
@@ -31,17 +30,7 @@ class Drawing(NamedTuple):
     step: int  #: Number of the denoising step
 
 
-for _function in (
-    noise.xor_shift,
-    noise.hash32,
-    noise.stream_key,
-    noise.normal_pair,
-    noise.unit_interval,
-    noise.quarter_sine,
-    noise.with_sign,
-    noise.log_unit,
-):
-    register_jitable(**INLINED)(_function)
+register(noise)
 
 
 @compiled
