@@ -1,12 +1,13 @@
-"""Discs and balls against the obstacles of a world, kind by kind, and its bounds."""
+"""What stands still in a world, obstacles kind by kind and bounds, and discs and balls against it."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from d4orm_env.verify.contact import StaticDiscs, Watch, side_names
+from d4orm_env.verify.contact import Stretch, Watch
 from d4orm_env.verify.geometry import (
     Floats,
     Indices,
@@ -22,83 +23,109 @@ if TYPE_CHECKING:
     from d4orm_env.core.world import World
 
 
-class Round(StaticDiscs):
-    """Robots against circles, spheres or vertical cylinders."""
+class Things(NamedTuple):
+    """Obstacles of a kind, or the sides of a world, by number."""
 
-    def __init__(self, robot: Indices, radius: Floats, obstacles: Floats, shape: str) -> None:
-        super().__init__("obstacle contact", robot, radius, [f"{shape}[{index}]" for index in range(len(obstacles))])
-        self._centres, self._sizes = obstacles[:, :-1], obstacles[:, -1]
+    names: list[str]
+    #: Signed distance from positions ``(..., d)`` to the surfaces of the things of these numbers [m]
+    distance: Callable[[Floats, Indices], Floats]
+    #: The smallest on the chords from these positions to those, and at what fraction of them
+    pass_by: Callable[[Floats, Floats, Indices], tuple[Floats, Floats]]
 
-    def distance(self, positions: Floats, columns: Indices) -> Floats:
-        return norm(self._offset(positions, columns)) - self._sizes[columns]
 
-    def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
-        distance, fraction = closest_approach(self._offset(start, columns), self._offset(end, columns))
-        return distance - self._sizes[columns], fraction
+def obstacles(world: World) -> Iterator[tuple[str, Floats, Things]]:
+    """Yield each kind of obstacle there is, and each polygon by itself, with its table or its corners."""
+    for kind, things in (("circles", _round), ("spheres", _round), ("cylinders", _round), ("boxes", _boxes)):
+        if len(table := np.asarray(getattr(world, kind), np.float64)):
+            yield kind, table, things([f"{kind}[{index}]" for index in range(len(table))], table)
+    for index, polygon in enumerate(world.polygons):
+        corners = np.asarray(polygon, np.float64)
+        yield "polygons", corners, _polygon([f"polygons[{index}]"], corners)
 
-    def _offset(self, positions: Floats, columns: Indices) -> Floats:
+
+def _round(names: list[str], table: Floats) -> Things:
+    centres, sizes = table[:, :-1], table[:, -1]
+
+    def offset(positions: Floats, columns: Indices) -> Floats:
         # A cylinder is a circle seen from above.
-        return positions[..., : self._centres.shape[1]] - self._centres[columns]
+        return positions[..., : centres.shape[1]] - centres[columns]
+
+    def pass_by(start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
+        distance, fraction = closest_approach(offset(start, columns), offset(end, columns))
+        return distance - sizes[columns], fraction
+
+    return Things(names, lambda positions, columns: norm(offset(positions, columns)) - sizes[columns], pass_by)
 
 
-class Boxes(StaticDiscs):
-    """Robots against axis-aligned boxes."""
-
-    def __init__(self, robot: Indices, radius: Floats, boxes: Floats) -> None:
-        super().__init__("obstacle contact", robot, radius, [f"boxes[{index}]" for index in range(len(boxes))])
-        self._boxes = boxes
-
-    def distance(self, positions: Floats, columns: Indices) -> Floats:
-        return box_distance(positions, self._boxes[columns])
-
-    def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
-        return box_approach(start, end, self._boxes[columns])
+def _boxes(names: list[str], table: Floats) -> Things:
+    return Things(
+        names,
+        lambda positions, columns: box_distance(positions, table[columns]),
+        lambda start, end, columns: box_approach(start, end, table[columns]),
+    )
 
 
-class PolygonObstacle(StaticDiscs):
-    """Robots against one polygon."""
-
-    def __init__(self, robot: Indices, radius: Floats, corners: Floats, name: str) -> None:
-        super().__init__("obstacle contact", robot, radius, [name])
-        self._corners = corners
-
-    def distance(self, positions: Floats, columns: Indices) -> Floats:
-        return polygon_distance(positions, self._corners)
-
-    def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
-        return polygon_approach(start, end, self._corners)
+def _polygon(names: list[str], corners: Floats) -> Things:
+    return Things(
+        names,
+        lambda positions, columns: polygon_distance(positions, corners),
+        lambda start, end, columns: polygon_approach(start, end, corners),
+    )
 
 
-class Bounds(StaticDiscs):
-    """Robots against the sides of the world."""
+def sides(world: World) -> Things:
+    """The sides of a world with bounds, the lower ones first."""
+    d, (lower, upper) = world.dimension, world.bounds.astype(np.float64)
+    ends = np.concatenate([lower, -upper])
 
-    def __init__(self, robot: Indices, radius: Floats, lower: Floats, upper: Floats) -> None:
-        super().__init__("bounds contact", robot, radius, side_names(len(lower)))
-        self._axis, self._sign = np.tile(np.arange(len(lower)), 2), np.repeat([1.0, -1.0], len(lower))
-        self._position = np.concatenate([lower, -upper])
-
-    def distance(self, positions: Floats, columns: Indices) -> Floats:
-        axis = np.broadcast_to(self._axis[columns], positions.shape[:-1])
+    def distance(positions: Floats, columns: Indices) -> Floats:
+        axis = np.broadcast_to(columns % d, positions.shape[:-1])
         value = np.take_along_axis(positions, axis[..., None], axis=-1)[..., 0]
-        return self._sign[columns] * value - self._position[columns]
+        return np.where(columns < d, value, -value) - ends[columns]
 
-    def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
-        before, after = self.distance(start, columns), self.distance(end, columns)
+    def pass_by(start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
+        before, after = distance(start, columns), distance(end, columns)
         return np.minimum(before, after), (after < before).astype(np.float64)
+
+    return Things(
+        [f"the {side} bound of {axis}" for side in ("lower", "upper") for axis in "xyz"[:d]], distance, pass_by
+    )
+
+
+class Static(Watch):
+    """Robots against things that stand still, one column each."""
+
+    def __init__(self, kind: str, robot: Indices, names: Sequence[str]) -> None:
+        rows, columns = (index.ravel() for index in np.indices((len(robot), len(names))))
+        super().__init__(kind, robot, names, rows, columns)
+
+    def bodies(self, pairs: Indices) -> Sequence[Indices]:
+        return (self.rows[pairs],)
+
+    def thing(self, column: Indices) -> Indices:
+        return column
+
+
+class StaticDiscs(Static):
+    """The same of discs or balls."""
+
+    def __init__(self, kind: str, robot: Indices, radius: Floats, things: Things) -> None:
+        super().__init__(kind, robot, things.names)
+        self._radius, self._things = radius[self.rows], things
+
+    def gap(self, stretch: Stretch, steps: Indices, pairs: Indices, lead: Floats) -> Floats:
+        distance = self._things.distance(stretch.path[steps, 0, self.rows[pairs]], self.columns[pairs])
+        return distance - self._radius[pairs]
+
+    def approach(self, stretch: Stretch, steps: Indices, pairs: Indices) -> tuple[Floats, Floats]:
+        path = stretch.of(steps, self.rows[pairs])
+        distance, fraction = self._things.pass_by(path[:, :-1], path[:, 1:], self.columns[pairs][:, None])
+        return distance - self._radius[pairs][:, None], fraction
 
 
 def surroundings(world: World, robot: Indices, radius: Floats) -> list[Watch]:
     """Return a watch for each kind of obstacle there is, and for the bounds."""
-    watches: list[Watch] = []
-    for shape in ("circles", "spheres", "cylinders"):
-        obstacles = np.asarray(getattr(world, shape), np.float64)
-        if len(obstacles):
-            watches.append(Round(robot, radius, obstacles, shape))
-    if len(world.boxes):
-        watches.append(Boxes(robot, radius, np.asarray(world.boxes, np.float64)))
-    for index, corners in enumerate(world.polygons):
-        watches.append(PolygonObstacle(robot, radius, np.asarray(corners, np.float64), f"polygons[{index}]"))
+    watches: list[Watch] = [StaticDiscs("obstacle contact", robot, radius, own) for _, _, own in obstacles(world)]
     if world.lower is not None:
-        lower, upper = (np.asarray(bound, np.float64) for bound in (world.lower, world.upper))
-        watches.append(Bounds(robot, radius, lower, upper))
+        watches.append(StaticDiscs("bounds contact", robot, radius, sides(world)))
     return watches

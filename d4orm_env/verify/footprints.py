@@ -13,24 +13,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from d4orm_env.verify.contact import WIDER, Pairs, Static, Stretch, Watch, side_names
-from d4orm_env.verify.discs import surroundings
-from d4orm_env.verify.geometry import (
-    ConvexBodies,
-    Floats,
-    Indices,
-    ball_gap,
-    box_distance,
-    core_gap,
-    norm,
-    polygon_distance,
-)
+from d4orm_env.verify.contact import WIDER, Pairs, Stretch, Watch
+from d4orm_env.verify.discs import Static, Things, obstacles, sides, surroundings
+from d4orm_env.verify.geometry import ConvexBodies, Floats, Indices, ball_gap, core_gap, norm, polygon_distance
 
 if TYPE_CHECKING:
     from d4orm_env.core.world import World
 
-_Gap = Callable[[Indices, Indices, Floats, Floats], Floats]
-"""``(N,)`` gaps of things and bodies at positions and headings."""
+_Gap = Callable[[Floats, Indices, Indices, Floats, Floats], Floats]
+"""``(N,)`` gaps of things, by their table and numbers, and bodies at positions and headings."""
 HALVINGS = 20
 """Most times that a sub-step is halved."""
 RESOLUTION = 1 / 15_000
@@ -156,87 +147,61 @@ class Obstacles(TurningStatic):
         if world.dimension == 2:
             self._gap_to = {"circles": self._to_circle, "boxes": self._to_rectangle, "polygons": self._to_polygon}
         else:
-            self._gap_to = {"spheres": self._to_ball, "cylinders": self._to_cylinder, "boxes": self._to_box}
-        names = [f"{kind}[{index}]" for kind in self._gap_to for index in range(len(getattr(world, kind)))]
+            self._gap_to = {"spheres": self._to_round, "cylinders": self._to_round, "boxes": self._to_box}
+        self._kinds = [*obstacles(world)]
+        sizes = [len(things.names) for _, _, things in self._kinds]
+        self._kind, self._begins = np.repeat(np.arange(len(sizes)), sizes), np.cumsum([0, *sizes])
+        names = [name for _, _, things in self._kinds for name in things.names]
         super().__init__("obstacle contact", robot, shapes, names)
-        self._world = world
-        self._round = np.asarray(world.circles if world.dimension == 2 else world.spheres, np.float64)
-        self._cylinders, self._boxes = np.asarray(world.cylinders, np.float64), np.asarray(world.boxes, np.float64)
 
     def outer_gap(self, pairs: Indices, *positions: Floats) -> Floats:
         gaps, (position,) = np.empty(len(pairs)), positions
-        for kind, here, thing in self._by_kind(pairs):
-            gaps[here] = self._distance(kind, thing, position[here])
+        for (_, _, things), here, number in self._by_kind(pairs):
+            gaps[here] = things.distance(position[here], number)
         return gaps - WIDER * self.shapes.outer[self.rows[pairs]]
 
     def between(self, pairs: Indices, poses: Sequence[tuple[Floats, Floats]]) -> Floats:
         ((position, turn),), gaps = poses, np.empty(len(pairs))
-        for kind, here, thing in self._by_kind(pairs):
-            gaps[here] = self._gap_to[kind](thing, self.rows[pairs[here]], position[here], turn[here])
+        for (kind, table, _), here, number in self._by_kind(pairs):
+            gaps[here] = self._gap_to[kind](table, number, self.rows[pairs[here]], position[here], turn[here])
         return gaps
 
-    def _by_kind(self, pairs: Indices) -> Iterator[tuple[str, Indices, Indices]]:
+    def _by_kind(self, pairs: Indices) -> Iterator[tuple[tuple[str, Floats, Things], Indices, Indices]]:
         """Yield each kind of obstacle with the pairs, of ``(N,)``, that concern one, and its number."""
-        column, first = self.columns[pairs], 0
-        for kind in self._gap_to:
-            end = first + len(getattr(self._world, kind))
-            here = np.flatnonzero((column >= first) & (column < end))
-            if len(here):
-                yield kind, here, column[here] - first
-            first = end
+        column = self.columns[pairs]
+        kinds = self._kind[column]
+        for kind in np.unique(kinds):
+            here = np.flatnonzero(kinds == kind)
+            yield self._kinds[kind], here, column[here] - self._begins[kind]
 
-    def _distance(self, kind: str, thing: Indices, position: Floats) -> Floats:
-        """``(N,)`` signed distance from positions to obstacles."""
-        if kind == "boxes":
-            return box_distance(position, self._boxes[thing])
-        if kind == "polygons":
-            distance = np.empty(len(thing))
-            for polygon in np.unique(thing):
-                here = np.flatnonzero(thing == polygon)
-                corners = np.asarray(self._world.polygons[polygon], np.float64)
-                distance[here] = polygon_distance(position[here], corners)
-            return distance
-        things = self._cylinders if kind == "cylinders" else self._round
-        centre = things[thing, :-1]
-        return norm(position[:, : centre.shape[1]] - centre) - things[thing, -1]
-
-    def _to_circle(self, thing: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
+    def _to_circle(self, table: Floats, number: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
         core = self.shapes.placed(body, np.zeros_like(position), turn)
-        centre = (self._round[thing, :2] - position)[:, None]
-        return core_gap(core, centre) - self.shapes.rounding[body] - self._round[thing, 2]
+        centre = (table[number, :2] - position)[:, None]
+        return core_gap(core, centre) - self.shapes.rounding[body] - table[number, 2]
 
-    def _to_rectangle(self, thing: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
-        left, low, right, high = (self._boxes[thing] - np.tile(position, 2)).T
+    def _to_rectangle(self, table: Floats, number: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
+        left, low, right, high = (table[number] - np.tile(position, 2)).T
         corners = np.stack([left, low, right, low, right, high, left, high], axis=-1).reshape(-1, 4, 2)
         core = self.shapes.placed(body, np.zeros_like(position), turn)
         return core_gap(core, corners) - self.shapes.rounding[body]
 
-    def _to_polygon(self, thing: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
-        gaps = np.empty(len(thing))
-        for polygon in np.unique(thing):
-            here = np.flatnonzero(thing == polygon)
-            corners = np.asarray(self._world.polygons[polygon], np.float64)
-            core, least = self.shapes.placed(body[here], position[here], turn[here]), np.full(len(here), np.inf)
-            for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-                edge = np.broadcast_to(np.stack([begin, end]), (len(here), 2, 2))
-                least = np.minimum(least, core_gap(core, edge))
-            # What lies within it crosses no edge.
-            inside = (least > 0) & (polygon_distance(core[:, 0], corners) < 0)
-            gaps[here] = np.where(inside, -least, least) - self.shapes.rounding[body[here]]
-        return gaps
+    def _to_polygon(self, corners: Floats, number: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
+        core, least = self.shapes.placed(body, position, turn), np.full(len(number), np.inf)
+        for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            edge = np.broadcast_to(np.stack([begin, end]), (len(number), 2, 2))
+            least = np.minimum(least, core_gap(core, edge))
+        # What lies within it crosses no edge.
+        inside = (least > 0) & (polygon_distance(core[:, 0], corners) < 0)
+        return np.where(inside, -least, least) - self.shapes.rounding[body]
 
-    def _to_ball(self, thing: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
-        del turn
-        return ball_gap(self._round[thing, :3] - position, self.shapes.semi_axes[body], _ball(self._round[thing, 3]))
+    def _to_round(self, table: Floats, number: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
+        centre, radius = table[number, :-1], table[number, -1]
+        # A cylinder is as near as the ball beside the body.
+        offset = np.pad(centre - position[:, : centre.shape[1]], ((0, 0), (0, 3 - centre.shape[1])))
+        return ball_gap(offset, self.shapes.semi_axes[body], np.repeat(radius[:, None], 3, axis=1))
 
-    def _to_cylinder(self, thing: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
-        del turn
-        offset = np.pad(self._cylinders[thing, :2] - position[:, :2], ((0, 0), (0, 1)))
-        return ball_gap(offset, self.shapes.semi_axes[body], _ball(self._cylinders[thing, 2]))
-
-    def _to_box(self, thing: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
-        del turn
-        offset = np.clip(position, self._boxes[thing, :3], self._boxes[thing, 3:]) - position
+    def _to_box(self, table: Floats, number: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
+        offset = np.clip(position, table[number, :3], table[number, 3:]) - position
         axes = self.shapes.semi_axes[body]
         factor = np.maximum(norm(offset / axes), 1e-6)
         return np.maximum(norm(offset) * (1 - 1 / factor), -axes.min(axis=1))
@@ -245,33 +210,22 @@ class Obstacles(TurningStatic):
 class Sides(TurningStatic):
     """Robots against the sides of the world."""
 
-    def __init__(self, robot: Indices, shapes: ConvexBodies, lower: Floats, upper: Floats) -> None:
-        super().__init__("bounds contact", robot, shapes, side_names(len(lower)))
-        self._axis, self._sign = np.tile(np.arange(len(lower)), 2), np.repeat([1.0, -1.0], len(lower))
-        self._position = np.concatenate([lower, -upper])
-
-    def _inside(self, pairs: Indices, position: Floats) -> Floats:
-        """``(N,)`` distance of positions ``(N, d)`` from their sides, negative outside."""
-        column = self.columns[pairs]
-        at = position[np.arange(len(column)), self._axis[column]]
-        return self._sign[column] * at - self._position[column]
+    def __init__(self, robot: Indices, shapes: ConvexBodies, world: World) -> None:
+        self._sides = sides(world)
+        super().__init__("bounds contact", robot, shapes, self._sides.names)
 
     def outer_gap(self, pairs: Indices, *positions: Floats) -> Floats:
-        return self._inside(pairs, *positions) - WIDER * self.shapes.outer[self.rows[pairs]]
+        return self._sides.distance(positions[0], self.columns[pairs]) - WIDER * self.shapes.outer[self.rows[pairs]]
 
     def between(self, pairs: Indices, poses: Sequence[tuple[Floats, Floats]]) -> Floats:
-        ((position, turn),) = poses
-        column, body = self.columns[pairs], self.rows[pairs]
-        axis, at = self._axis[column], self._inside(pairs, position)
+        ((position, turn),), column, body = poses, self.columns[pairs], self.rows[pairs]
+        axis, at = column % position.shape[1], self._sides.distance(position, column)
         if position.shape[1] == 3:
             return at - self.shapes.semi_axes[body, axis]
         corners = self.shapes.placed(body, np.zeros_like(position), turn)
         along = np.take_along_axis(corners, axis[:, None, None], axis=2)[..., 0]
-        return at + (self._sign[column][:, None] * along).min(axis=1) - self.shapes.rounding[body]
-
-
-def _ball(radius: Floats) -> Floats:
-    return np.repeat(radius[:, None], 3, axis=1)
+        inward = np.where(column < 2, 1.0, -1.0)[:, None]
+        return at + (inward * along).min(axis=1) - self.shapes.rounding[body]
 
 
 def make_watches(
@@ -290,6 +244,5 @@ def make_watches(
             return pairs, surroundings(world, robot, shapes.outer)
     watches: list[Watch] = [Obstacles(robot, shapes, world)] if world.num_obstacles else []
     if world.lower is not None:
-        lower, upper = (np.asarray(bound, np.float64) for bound in (world.lower, world.upper))
-        watches.append(Sides(robot, shapes, lower, upper))
+        watches.append(Sides(robot, shapes, world))
     return pairs, watches
