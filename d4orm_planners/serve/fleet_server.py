@@ -14,10 +14,8 @@ from d4orm_env.core.problem import Problem
 from d4orm_planners.base.controller import Controller
 from d4orm_planners.base.measured_states import OLDEST
 from d4orm_planners.serve import wire
-from d4orm_planners.serve.commands import FleetCommands
-from d4orm_planners.serve.running_on import RunningOn, slowed
-from d4orm_planners.serve.wanted_goals import WantedGoals
-from d4orm_planners.serve.wire import FleetRobot, RosSession, Subscriber, position_of, turned
+from d4orm_planners.serve.fleet import FleetCommands, FleetRobot, RunningOn, WantedGoals, slowed
+from d4orm_planners.serve.wire import RosSession, Subscriber, position_of, turned
 from d4orm_planners.tracking.reference_feedback import ControlSetpoint
 from d4orm_planners.tracking.steering import braking_share
 

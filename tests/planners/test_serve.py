@@ -31,15 +31,14 @@ from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings
 zenoh = pytest.importorskip("zenoh")
 typesys = pytest.importorskip("rosbags.typesys", reason="rosbags is not installed: pip install 'd4orm-env[ros]'")
 
+from d4orm_planners.serve.fleet import FleetRobot, RunningOn  # noqa: E402
 from d4orm_planners.serve.fleet_server import FleetServer  # noqa: E402
-from d4orm_planners.serve.running_on import RunningOn  # noqa: E402
 from d4orm_planners.serve.wire import (  # noqa: E402
     BOOL,
     ODOMETRY,
     POSE,
     TRAJECTORY,
     TWIST,
-    FleetRobot,
     RosSession,
     state_from,
     twist,
