@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -181,7 +180,7 @@ class TeamBodies:
         pull[self._held[self._servos]] = 0
         self.data.qfrc_applied[self._servo_dofs] = self.scene.mass[self._servos, None] * pull
 
-    def _turn_wheels(self, commands: WheelCommands, time: float) -> None:
+    def _turn_wheels(self, commands: Floats, time: float) -> None:
         """Have the wheels follow commands that were given so long before the end of MuJoCo's next step [s]."""
         if not len(self._drives):
             return
@@ -189,8 +188,8 @@ class TeamBodies:
         torque[self._held[self._drives]] = 0
         self.data.qfrc_applied[self._wheel_dofs] = torque
 
-    def _commands(self, controls: FloatArray, states: FloatArray, limits: FloatArray) -> WheelCommands:
-        """Return the drives' commands: a turn rate and a speed, or their changes from those wanted last."""
+    def _commands(self, controls: FloatArray, states: FloatArray, limits: FloatArray) -> Floats:
+        """``(D, 2, 4)`` the drives' commands, for :meth:`WheelControl.torque`."""
         rows = []
         for robot in self._drives.tolist():
             first, second = controls[robot, :2].tolist()
@@ -198,15 +197,15 @@ class TeamBodies:
             lower, speeds = model.lower_bounds(own), states[robot, list(model.speed_indices)].tolist()
             allowed, turns = ((-float(lower[limit]), float(own[limit])) for limit in (SPEED, TURN_RATE))
             if not speeds:
-                rows.append((first, 0.0, *allowed, second, 0.0, *turns))
+                rows.append(((first, 0.0, *allowed), (second, 0.0, *turns)))
                 continue
             push, turn, swing = second, first, 0.0
             if model.name == UNICYCLE2.name:
                 push, swing, now = first, second, float(states[robot, TURNING])
                 turn = self._onward(robot, 1, now, swing, float(own[MAX_TURN_ACCELERATION]), turns)
             speed = self._onward(robot, 0, speeds[0], push, float(own[ACCELERATION]), allowed)
-            rows.append((speed, push, *allowed, turn, swing, *turns))
-        return WheelCommands(*np.array(rows, np.float64).reshape(-1, 8).T)
+            rows.append(((speed, push, *allowed), (turn, swing, *turns)))
+        return np.array(rows, np.float64).reshape(-1, 2, 4)
 
     def _onward(
         self, robot: int, which: int, now: float, change: float, most: float, limits: tuple[float, float]
@@ -222,19 +221,6 @@ class TeamBodies:
         owners = self.scene.owner[contact.geom]
         meeting = owners[(owners != NOT_SOLID).all(axis=1) & (contact.dist <= 0)].ravel()
         touched[meeting[meeting != OBSTACLE]] = True
-
-
-class WheelCommands(NamedTuple):
-    """Commands of ``D`` drives from the beginning of a step on, each ``(D,)``."""
-
-    speed: Floats  #: At the beginning [m/s]
-    acceleration: Floats  #: From there on [m/s^2]
-    least: Floats  #: Speed backwards at most, negative [m/s]
-    most: Floats  #: Speed forwards at most [m/s]
-    turn_rate: Floats  #: At the beginning [rad/s]
-    turn_acceleration: Floats  #: From there on [rad/s^2]
-    least_turn: Floats  #: Turn rate to the right at most, negative [rad/s]
-    most_turn: Floats  #: The same to the left [rad/s]
 
 
 class WheelControl:
@@ -270,18 +256,19 @@ class WheelControl:
         """Forget the past of some drives ``(D,)``."""
         self._integral[drives] = 0
 
-    def torque(self, commands: WheelCommands, time: float, step: float, spin: Floats) -> Floats:
+    def torque(self, commands: Floats, time: float, step: float, spin: Floats) -> Floats:
         """``(D, 2)`` torques of left and right wheels for the next step [N m].
 
-        ``time`` is since the commands were given, at the end of the step [s], and ``spin`` ``(D, 2)`` the present
-        speeds of the wheels [rad/s].
+        ``commands`` ``(D, 2, 4)`` are a speed and a turn rate when they were given, their changes from there on, and
+        the least and the most that they may be [m/s, rad/s]; ``time`` is since then, at the end of the step [s], and
+        ``spin`` ``(D, 2)`` the present speeds of the wheels [rad/s].
         """
-        wanted = commands.speed + time * commands.acceleration
-        speed = np.clip(wanted, commands.least, commands.most)
-        turn_rate = commands.turn_rate + time * commands.turn_acceleration
-        turning = np.clip(turn_rate, commands.least_turn, commands.most_turn) * self._half_track
+        begin, change, least, most = commands.transpose(2, 0, 1)
+        wanted = begin + time * change
+        speed, turning = np.clip(wanted, least, most).T
+        turning = turning * self._half_track
         reference = np.stack([speed - turning, speed + turning], axis=1) / self.radius[:, None]
-        ahead = np.where(speed == wanted, commands.acceleration, 0.0) / self.radius
+        ahead = np.where(speed == wanted[:, 0], change[:, 0], 0.0) / self.radius
         error = reference - spin
         integral = self._integral + step * error
         torque = self._inertia * ahead[:, None] + self._proportional * error + self._integral_gain * integral
