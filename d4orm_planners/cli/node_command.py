@@ -200,34 +200,18 @@ CONTROLLER = {"mode", "reserve", "timeout", "lag", "tracker"}  #: Settings of th
 SHARE = 0.9  #: Share of a period that the policy may take
 
 
-@dataclass(frozen=True)
-class ServeTask:
-    """Task of a server, as its file has it."""
-
-    problem: Problem
-    controller: Controller
-    names: tuple[str, ...]
-    deadline: float
-    watchdog: float | None
-    domain: int
-    seed: int
-    zenoh: ZenohSettings
-    wire: str
-    stamps: bool
-
-
 def serve(config: Annotated[Path, Option("--config", "-c", help="YAML file that says what is to be served.")]) -> None:
     """Drive robots on a ROS 2 network over Zenoh: odometry in, velocities and setpoints out, until Ctrl-C."""
-    task, over = read_task(config, FIELDS[:1], FIELDS[1:], _serve_task), threading.Event()
+    (network, fleet), over = read_task(config, FIELDS[:1], FIELDS[1:], _serve_task), threading.Event()
     # Robots are told to stand once it is set.
-    with on_signals(lambda *_: over.set()), RosSession(task.zenoh, task.domain, NODE, task.wire) as session:
-        how = task.deadline, task.seed, task.stamps, task.watchdog
-        server = FleetServer(session, task.problem, task.controller, task.names, *how)
-        typer.echo(f"serving {', '.join(task.names)} on domain {task.domain}; Ctrl-C ends it")
+    with on_signals(lambda *_: over.set()), RosSession(**network) as session:
+        server = FleetServer(session, **fleet)
+        typer.echo(f"serving {', '.join(fleet['names'])} on domain {network['domain']}; Ctrl-C ends it")
         server.run(over)
 
 
-def _serve_task(fields: Mapping[str, Any], folder: Path) -> ServeTask:
+def _serve_task(fields: Mapping[str, Any], folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arguments of the session and of the server of a file."""
     problem = problem_in(fields["problem"], folder)
     zenoh = zenoh_in(fields, folder)
     for name in ("namespace", "grace_period"):
@@ -247,15 +231,14 @@ def _serve_task(fields: Mapping[str, Any], folder: Path) -> ServeTask:
     names = fields.get("robots", [f"robot_{robot}" for robot in range(problem.num_robots)])
     if not isinstance(names, list) or not all(isinstance(name, str) and name.isidentifier() for name in names):
         raise ValueError(f"robots is {names!r}; give a list of names of letters, digits and '_'")
-    return ServeTask(
-        problem=problem,
-        controller=Controller(policy, **own, **settings),
-        names=tuple(names),
-        deadline=fields.get("deadline", 0.5),
-        watchdog=fields.get("watchdog"),
-        domain=whole_number(fields.get("domain", 0), "domain", 0, 232),
-        seed=whole_number(fields.get("seed", 0), "seed", 0),
-        zenoh=ZenohSettings.of(zenoh),
-        wire=wire,
-        stamps=truth(fields.get("stamps", False), "stamps"),
-    )
+    fleet = {
+        "problem": problem,
+        "controller": Controller(policy, **own, **settings),
+        "names": tuple(names),
+        "deadline": fields.get("deadline", 0.5),
+        "seed": whole_number(fields.get("seed", 0), "seed", 0),
+        "stamped": truth(fields.get("stamps", False), "stamps"),
+        "watchdog": fields.get("watchdog"),
+    }
+    domain = whole_number(fields.get("domain", 0), "domain", 0, 232)
+    return {"settings": ZenohSettings.of(zenoh), "domain": domain, "node": NODE, "wire": wire}, fleet
