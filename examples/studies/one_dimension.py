@@ -18,8 +18,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from examples.common import COLOURS, argument_parser, count, plt, save_figure, save_table
 
-from d4orm_planners.sampling.settings import annealed, constant
-from d4orm_planners.sampling.weights import SoftmaxWeights
+from d4orm_planners.sampling.settings import SoftmaxWeights, annealed, constant
 
 START = -2.5
 Objective: TypeAlias = Callable[[Any], Any]
