@@ -18,7 +18,6 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_planner
-from d4orm_planners.baselines.mmd.constraint_tree import Constraint, count_conflicts, first_conflict
 from d4orm_planners.baselines.mmd.motions import PathSurroundings, guide
 from d4orm_planners.baselines.mmd.path_frame import (
     FEATURES,
@@ -29,7 +28,7 @@ from d4orm_planners.baselines.mmd.path_frame import (
     sine_table,
     world_space,
 )
-from d4orm_planners.baselines.mmd.planner import MMDConfig, Planning
+from d4orm_planners.baselines.mmd.planner import Constraint, MMDConfig, Planning, count_conflicts, first_conflict
 from d4orm_planners.baselines.mmd.prior import (
     CLIP,
     LEVELS,
@@ -344,8 +343,8 @@ def test_planning_again_begins_with_what_was_planned() -> None:
     found = {}
     for reuse in (3, None):
         denoiser = Denoiser(problem, MMDConfig(num_samples=8, reuse_steps=reuse), lambda: False)
-        batch = denoiser.denoise(0, frame, surroundings(problem), 2, before if reuse else None)
-        found[batch.steps] = batch.driven.positions[:, 25, 1]
+        _, driven, steps = denoiser.denoise(0, frame, surroundings(problem), 2, before if reuse else None)
+        found[steps] = driven.positions[:, 25, 1]
     # Every second motion is its neighbour's mirror image.
     assert abs(found[3][::2]).min() > 3 * abs(found[25]).mean()
 

@@ -1,36 +1,29 @@
 """MMD as a planner: single-robot diffusion, and conflict-based search over it (CBS, ECBS, xECBS).
 
-The search decides which robot plans again, and under which constraints.
+The search decides which robot plans again, clear of where it met another. Its tree has motions of a team, their
+conflicts, and the constraints that these put on robots.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from dataclasses import dataclass, field, replace
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.paths.spaces import Space
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count, NotNegative, Number, Samples, ShareOrNone, Steps
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.baselines.mmd.constraint_tree import (
-    Constraint,
-    RobotMotion,
-    Tree,
-    TreeNode,
-    count_conflicts,
-    first_conflict,
-)
 from d4orm_planners.baselines.mmd.motions import PathSurroundings, guide, motion_kernel
 from d4orm_planners.baselines.mmd.path_frame import PathFrame, make_frame, world_space
-from d4orm_planners.baselines.mmd.prior import Batch, Denoiser
+from d4orm_planners.baselines.mmd.prior import Denoiser
 from d4orm_planners.mapf.planner import NoPaths
 
 SLACK = 1 / 75  #: Added to distances when conflicts are sought, for rounding, in radii of the largest robot
@@ -65,6 +58,75 @@ class MMDConfig(PlannerConfig):
         super().__post_init__()
         if self.slowest < self.quickest:
             raise ValueError(f"slowest is {self.slowest:g}; it must be at least quickest, which is {self.quickest:g}")
+
+
+def count_conflicts(positions: Floats, others: Floats, distances: Floats) -> IntArray:
+    """``(B, 2)`` numbers of other robots that each of some paths conflicts with, and of steps at which it does.
+
+    Paths are ``(B, T, 3)``, the others' ``(S, T, 3)``, and ``distances`` to keep from each ``(S,)`` [m].
+    """
+    steps = _too_near(positions[:, None] - others, distances[:, None]).sum(axis=2)
+    return np.stack([(steps > 0).sum(axis=1), steps.sum(axis=1)], axis=1)
+
+
+def first_conflict(positions: Floats, distances: Floats) -> tuple[int, int, tuple[int, int]]:
+    """Number of pairs in conflict, and the step and the robots of the earliest conflict; robots are -1 for none.
+
+    Paths are ``(K, T, 3)``, and ``distances`` to keep ``(K, K)`` [m].
+    """
+    one, other = np.tril_indices(len(positions), -1)
+    near = _too_near(positions[one] - positions[other], distances[one, other, None])
+    if not near.any():
+        return 0, positions.shape[1], (-1, -1)
+    step = int(near.any(axis=0).argmax())
+    pair = int(near[:, step].argmax())
+    return int(near.any(axis=1).sum()), step, (int(one[pair]), int(other[pair]))
+
+
+def _too_near(gaps: Floats, distances: Floats) -> BoolArray:
+    """Check which gaps ``(..., 3)`` are no longer than the distances to keep [m]."""
+    return gaps[..., 0] ** 2 + gaps[..., 1] ** 2 + gaps[..., 2] ** 2 <= distances**2
+
+
+class Constraint(NamedTuple):
+    """A sphere that one robot's centre has to be out of for some steps."""
+
+    sphere: tuple[float, float, float, float]  #: Centre and radius [m]
+    span: tuple[int, int]  #: First and last step
+
+
+@dataclass(frozen=True, eq=False)
+class RobotMotion:
+    """Motion of one robot in a node of the tree."""
+
+    motions: FloatArray  #: ``(B, SIZE)`` all that were denoised with it, which the next ones begin with
+    controls: FloatArray  #: ``(H, m)``
+    positions: Floats  #: ``(H+1, 3)`` [m]
+    cost: int  #: Steps until it arrives
+    fails: bool  #: Whether it comes too near to an obstacle or does not arrive
+
+
+@dataclass(frozen=True, order=True)
+class TreeNode:
+    """A node of the tree; the one to be expanded next is the least."""
+
+    conflicts: int  #: Pairs in conflict, and robots that fail by themselves
+    cost: int  #: Sum of the robots' steps until arrival
+    number: int  #: Of the node, counted as they are made
+    motions: tuple[RobotMotion, ...] = field(compare=False)  #: Of the robots
+    constraints: tuple[tuple[Constraint, ...], ...] = field(compare=False)  #: Of each robot
+    pair: tuple[int, int] = field(compare=False)  #: Two robots in conflict, or -1
+    step: int = field(compare=False)  #: Of their conflict
+
+
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """The state of the search: nodes that are not expanded yet, best first, and how many were made."""
+
+    frames: tuple[PathFrame, ...]
+    space: Space
+    nodes: tuple[TreeNode, ...]
+    made: int
 
 
 class Planning:
@@ -159,17 +221,13 @@ class Planning:
             pull=config.soft_pull,
         )
         with self._denoising():
-            batch = self._denoiser.denoise(robot, frame, surroundings, seed, before)
-        self.steps += batch.steps
-        return self._choose(batch, paths, distances, frame.safety_distance)
-
-    def _choose(self, batch: Batch, paths: Floats, distances: Floats, safety_distance: float) -> RobotMotion:
-        driven = batch.driven
+            denoised, driven, steps = self._denoiser.denoise(robot, frame, surroundings, seed, before)
+        self.steps += steps
         counts = count_conflicts(driven.positions, paths, distances)
-        fails = (driven.arrivals > self._problem.horizon) | (driven.clearances < safety_distance + self._slack)
+        fails = (driven.arrivals > self._problem.horizon) | (driven.clearances < frame.safety_distance + self._slack)
         best = int(np.lexsort((driven.arrivals, counts[:, 1], counts[:, 0], fails))[0])
         controls, positions = driven.controls[best].copy(), driven.positions[best].copy()
-        return RobotMotion(batch.motions, controls, positions, int(driven.arrivals[best]), bool(fails[best]))
+        return RobotMotion(denoised, controls, positions, int(driven.arrivals[best]), bool(fails[best]))
 
 
 class MMD(Planner):
@@ -205,8 +263,9 @@ class MMD(Planner):
             unlucky = int(failed[0]) if len(failed) else search.iteration % problem.num_robots
             added = planning.children(state.nodes[0], state.made, _seeds(search, 2), unlucky)
         best = min(added)
-        note = f"{best.conflicts} conflicts, {state.made + len(added)} nodes"
-        return state.with_nodes(added), Iteration(best.controls, planning.steps, note=note)
+        state = replace(state, nodes=tuple(sorted([*state.nodes[1:], *added])), made=state.made + len(added))
+        controls = np.stack([motion.controls for motion in best.motions], axis=1)
+        return state, Iteration(controls, planning.steps, note=f"{best.conflicts} conflicts, {state.made} nodes")
 
 
 def _begin(search: SolveRun) -> Tree | NoPaths:

@@ -7,7 +7,6 @@ examples. Its sums run in the order in which they are written, so that a seed ha
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -170,16 +169,6 @@ def drive_motions(
     return driven
 
 
-@dataclass(frozen=True)
-class Batch:
-    """Motions of one robot that were denoised together."""
-
-    motions: FloatArray  #: ``(B, SIZE)`` float32 whitened modes
-    durations: Floats  #: ``(B,)`` how long each takes [s]
-    driven: TrackedMotions  #: Rollouts along them
-    steps: int  #: Denoising steps that it took
-
-
 class Denoiser:
     """Denoiser of the motions of a team's robots, one robot at a time."""
 
@@ -192,12 +181,12 @@ class Denoiser:
 
     def denoise(
         self, robot: int, frame: PathFrame, surroundings: PathSurroundings, seed: int, before: FloatArray | None = None
-    ) -> Batch:
+    ) -> tuple[FloatArray, TrackedMotions, int]:
         """Motions of a robot that mind its surroundings, as well as guidance achieves it; the seed is of noise and
         durations.
 
         They begin with noise, or with motions ``before`` ``(B, SIZE)``, which get the noise of the last ``reuse_steps``
-        again.
+        again. ``(B, SIZE)`` float32 whitened modes, rollouts along them, and the denoising steps that they took.
         """
         config, count = self._config, self._config.num_samples
         draw = _Draws(seed)
@@ -221,7 +210,7 @@ class Denoiser:
         driven = drive_motions(
             self._problem, robot, frame, self._sines, self._deviation, surroundings.space, durations, motions
         )
-        return Batch(motions, durations, driven, done)
+        return motions, driven, done
 
     def _less_noisy(self, step: int, noisy: FloatArray, clean: FloatArray, draw: _Draws) -> FloatArray:
         """A draw from what a step's noisier motions say of the next step's: the posterior of DDPM, given clean ones."""
