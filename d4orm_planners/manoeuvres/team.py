@@ -13,8 +13,7 @@ from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_planners.manoeuvres.closing import ends_of
-from d4orm_planners.manoeuvres.detours import anywhere, starting_from, without_goal
-from d4orm_planners.manoeuvres.fixed_path import on_fixed_path
+from d4orm_planners.manoeuvres.detours import anywhere, on_fixed_path, starting_from, without_goal
 from d4orm_planners.manoeuvres.lattice import buffer_size
 from d4orm_planners.manoeuvres.nodes import Nodes
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE

@@ -16,7 +16,7 @@ from d4orm_env.verify import verify
 from d4orm_planners import make_planner
 from d4orm_planners.manoeuvres import rounds as team_rounds
 from d4orm_planners.manoeuvres import team as team_motions
-from d4orm_planners.manoeuvres.fixed_path import on_fixed_path
+from d4orm_planners.manoeuvres.detours import on_fixed_path
 from d4orm_planners.manoeuvres.team import TeamMotions
 from d4orm_planners.mapf.lns import search_neighbourhoods
 
