@@ -1,4 +1,4 @@
-"""The messages of D-D4orm, candidates as bytes, and their transport: its protocol, and threads as the simplest one.
+"""The messages of D-D4orm, candidates as bytes, and their transport: the threads of a process as the simplest one.
 
 Layout, little-endian: magic, version, feasible, node, sequence, ``H``, ``K``, ``m``, reward (float64), the problem's
 SHA-256; then ``(H, K, m)`` controls as float32; then the CRC-32 of all before. Whatever else arrives is told apart by
@@ -10,9 +10,9 @@ from __future__ import annotations
 import struct
 import threading
 import zlib
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -117,39 +117,32 @@ TRANSPORTS = ("local", "ray", "zenoh")
 WAITING = 64  #: Messages that wait for a slow node at most; then the oldest are lost, which newer ones replace anyhow
 
 
-class Transport(Protocol):
-    """One node's access to the others. Messages are bytes; they may get lost, and come in any order."""
+class Transport(ABC):
+    """One node's access to the others. Messages are bytes; they may get lost, and come in any order.
 
-    def publish(self, data: bytes) -> None:
-        """Send to all other nodes, without waiting for them; nothing happens once closed."""
-        ...
-
-    def collect(self, timeout: float = 0.0) -> list[bytes]:
-        """Everything that has arrived since the last call; waits up to ``timeout`` [s] for something to arrive.
-
-        Once closed there is nothing, at once.
-        """
-        ...
-
-    def close(self) -> None:
-        """Leave. A call that waits in :meth:`collect` is woken; closing again does no harm."""
-        ...
-
-
-class Mailbox:
-    """The receiving end of a transport: a queue of messages, whatever thread they come from."""
+    What arrives, whatever thread it comes from, is kept until it is collected.
+    """
 
     def __init__(self) -> None:
         self._arrived: deque[bytes] = deque(maxlen=WAITING)
         self._changed = threading.Condition()
         self.closed = False
 
+    @abstractmethod
+    def publish(self, data: bytes) -> None:
+        """Send to all other nodes, without waiting for them; nothing happens once closed."""
+
     def put(self, data: bytes) -> None:
+        """Let a message arrive."""
         with self._changed:
             self._arrived.append(data)
             self._changed.notify_all()
 
     def collect(self, timeout: float = 0.0) -> list[bytes]:
+        """Everything that has arrived since the last call; waits up to ``timeout`` [s] for something to arrive.
+
+        Once closed there is nothing, at once.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._arrived, timeout)
             messages = [] if self.closed else list(self._arrived)
@@ -157,22 +150,25 @@ class Mailbox:
         return messages
 
     def close(self) -> None:
-        """Wake waiting calls; from now on nothing arrives."""
+        """Leave. A call that waits in :meth:`collect` is woken; closing again does no harm."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
 
 
-class LocalTransport(Mailbox):
+class LocalTransport(Transport):
     """The ``"local"`` transport: one end of a :class:`LocalNetwork`."""
 
-    def __init__(self, network: LocalNetwork) -> None:
+    def __init__(self, ends: list[LocalTransport]) -> None:
         super().__init__()
-        self._network = network
+        self._ends = ends
 
     def publish(self, data: bytes) -> None:
-        if not self.closed:
-            self._network.deliver(self, bytes(data))
+        if self.closed:
+            return
+        for end in self._ends.copy():
+            if end is not self:
+                end.put(bytes(data))
 
 
 class LocalNetwork:
@@ -180,18 +176,9 @@ class LocalNetwork:
 
     def __init__(self) -> None:
         self._ends: list[LocalTransport] = []
-        self._lock = threading.Lock()
 
     def join(self) -> LocalTransport:
         """A new end of the network; it receives what is sent from now on."""
-        end = LocalTransport(self)
-        with self._lock:
-            self._ends.append(end)
+        end = LocalTransport(self._ends)
+        self._ends.append(end)
         return end
-
-    def deliver(self, sender: LocalTransport, data: bytes) -> None:
-        """Give a message to every end but the sender's."""
-        with self._lock:
-            ends = [end for end in self._ends if end is not sender]
-        for end in ends:
-            end.put(data)

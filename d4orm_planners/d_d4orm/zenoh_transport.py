@@ -21,7 +21,7 @@ from pydantic import AfterValidator, BeforeValidator
 from d4orm_env.core.files import require_file
 from d4orm_env.core.lazy import LazyModule, load
 from d4orm_planners.base.settings import CheckedSettings, PathText, Seconds
-from d4orm_planners.d_d4orm.transport import MAX_BYTES, WAITING, Mailbox
+from d4orm_planners.d_d4orm.transport import MAX_BYTES, WAITING, Transport
 
 _zenoh: Any = LazyModule("zenoh", "transport 'zenoh'", "zenoh")
 
@@ -108,7 +108,7 @@ class ZenohSettings(CheckedSettings):
         return all(_is_loopback(endpoint) for endpoint in self.listen)
 
 
-class ZenohTransport(Mailbox):
+class ZenohTransport(Transport):
     """One end of a network of zenoh peers. The environment variable ``RUST_LOG`` makes zenoh log what it does.
 
     Raises:
