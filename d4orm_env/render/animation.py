@@ -6,6 +6,7 @@ import shutil
 import subprocess
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 
@@ -106,37 +107,28 @@ def frame_size(problem: Problem, trajectory: Trajectory) -> tuple[int, int]:
     return 520, 2 * int(np.clip(0.5 * (520 * 0.85 * height / width + 90), 120, 390))
 
 
+@dataclass(frozen=True, eq=False)
 class _Frames:
     """The images of an animation, drawn when asked for."""
 
-    def __init__(
-        self,
-        renderer: FrameRenderer,
-        trajectory: Trajectory,
-        steps: NDArray[np.int64],
-        events: DisturbanceEvents | None = None,
-    ) -> None:
-        self.renderer, self.trajectory, self.steps, self.events = renderer, trajectory, steps, events
-        self.contacts = contact_points(trajectory)
-
-    def __len__(self) -> int:
-        return len(self.steps)
+    renderer: FrameRenderer
+    trajectory: Trajectory
+    steps: NDArray[np.int64]
+    events: DisturbanceEvents | None
 
     def __iter__(self) -> Iterator[Frame]:
-        return (self.draw(int(step)) for step in self.steps)
-
-    def draw(self, step: int) -> Frame:
-        trajectory, problem = self.trajectory, self.renderer.problem
-        arrived = np.asarray(trajectory.arrived[step])
-        return self.renderer.draw(
-            trajectory.states[step],
-            arrived,
-            trajectory.collided[step],
-            trail=trajectory.positions[: step + 1],
-            contacts=self.contacts[step],
-            events=None if self.events is None else self.events.until(step),
-            caption=f"{problem.name}    {step * problem.dt:.1f} s    arrived {arrived.sum()} of {len(arrived)}",
-        )
+        trajectory, problem, contacts = self.trajectory, self.renderer.problem, contact_points(self.trajectory)
+        for step in self.steps.tolist():
+            arrived = np.asarray(trajectory.arrived[step])
+            yield self.renderer.draw(
+                trajectory.states[step],
+                arrived,
+                trajectory.collided[step],
+                trail=trajectory.positions[: step + 1],
+                contacts=contacts[step],
+                events=None if self.events is None else self.events.until(step),
+                caption=f"{problem.name}    {step * problem.dt:.1f} s    arrived {arrived.sum()} of {len(arrived)}",
+            )
 
 
 def _write_gif(path: Path, frames: _Frames, fps: float) -> None:
@@ -145,7 +137,7 @@ def _write_gif(path: Path, frames: _Frames, fps: float) -> None:
     palette.putpalette(picture_palette(frames.renderer.problem.num_robots, 256).tobytes())
     images = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     # GIF counts in hundredths of a second, so the times are rounded, not the durations: they must not drift.
-    times = np.round(100 * np.arange(len(frames)) / fps).astype(int)
+    times = np.round(100 * np.arange(len(frames.steps)) / fps).astype(int)
     durations = [10 * int(d) for d in np.diff(times)] + [int(1000 * _LAST_FRAME)]
     next(images).save(path, format="GIF", save_all=True, append_images=images, duration=durations, loop=0, disposal=1)
 

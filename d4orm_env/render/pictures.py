@@ -23,7 +23,7 @@ from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.core.summary_line import KeyFigure, count
 from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory, arrival_times
 from d4orm_env.render import own_style
-from d4orm_env.render.event_marks import MarkLayer
+from d4orm_env.render.frames import MarkLayer
 from d4orm_env.render.panels import (
     BODY,
     CONTACT,
