@@ -24,7 +24,7 @@ from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.base.episode import find_physics
-from d4orm_planners.base.planner_registry import PolicyLike, fresh_policy, is_brought, list_policies, origin
+from d4orm_planners.base.planner_registry import PolicyLike, called, fresh_policy, is_brought, list_policies, origin
 from d4orm_planners.evaluation.trials import Condition, Configuration, Job
 
 T = TypeVar("T")
@@ -151,7 +151,7 @@ def _labelled(policies: Policies) -> dict[str, tuple[PolicyLike, dict[str, objec
     labelled: dict[str, tuple[PolicyLike, dict[str, object]]] = {}
     several: tuple[PolicyLike, ...] = _several(policies)
     for policy in several:
-        label = policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
+        label = called(policy)
         if not (isinstance(policy, str) or is_brought(policy)):
             _checked_label(policy)
         if label in labelled:

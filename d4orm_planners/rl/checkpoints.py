@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -26,14 +26,6 @@ from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.task_mixture import MixedVecEnv
 
 figures: Any = LazyModule("matplotlib.figure")
-
-
-class Outcome(NamedTuple):
-    """Success rate, mean travel time [s], and the success rates of the parts of a mixture."""
-
-    success_rate: float
-    travel_time: float
-    parts: list[float]
 
 
 @dataclass(frozen=True)
@@ -58,11 +50,16 @@ class Evaluation:
         return self.success_rate, -self.travel_time
 
 
-def evaluate_network(network: Network, worlds: RobotVecEnv | MixedVecEnv, seed: int) -> Outcome:
-    """Run one episode in each world, without exploring; of a mixture, the mean of its parts."""
+def evaluate_network(
+    network: Network, worlds: RobotVecEnv | MixedVecEnv, seed: int
+) -> tuple[float, float, list[float]]:
+    """Success rate, mean travel time [s], and success rates of a mixture's parts, whose means the others are.
+
+    There is one episode in each world, without exploring.
+    """
     means = [np.mean(run_worlds(network, part, seed), axis=0) for part in worlds.parts]
     success, travel_time = (float(np.mean(values)) for values in zip(*means))
-    return Outcome(success, travel_time, [float(mean[0]) for mean in means])
+    return success, travel_time, [float(mean[0]) for mean in means]
 
 
 def run_worlds(network: Network, worlds: RobotVecEnv, seed: int) -> list[tuple[bool, float]]:

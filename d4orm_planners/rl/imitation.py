@@ -162,9 +162,9 @@ class _ImitationRun:
     ) -> None:
         network, (inputs, targets) = self._network(index, seconds), held
         error = float(np.sqrt(np.mean((network(inputs) - targets) ** 2)))
-        outcome = evaluate_network(network, self._validation, VALIDATION_SEED)
+        success, travel_time, _ = evaluate_network(network, self._validation, VALIDATION_SEED)
         evaluation = Evaluation(
-            steps, self.settings.num_robots, self.settings.scenario, outcome.success_rate, outcome.travel_time,
+            steps, self.settings.num_robots, self.settings.scenario, success, travel_time,
             seconds, recorded / seconds, error,
         )  # fmt: skip
         self.evaluations = [*self.evaluations, evaluation]

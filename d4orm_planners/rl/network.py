@@ -73,9 +73,7 @@ class Header(BaseModel):
 
     def text(self) -> str:
         """Return it as JSON, which earlier versions read where it says nothing that they do not know."""
-        optional = ("num_rays", "ray_range", "goal_headings", "encoder", "frame", "shortest_paths", "brakes")
-        unsaid = {name for name in optional if getattr(self, name) is None}
-        return self.model_dump_json(exclude=unsaid)
+        return self.model_dump_json(exclude_defaults=True)
 
 
 def range_sensors(number: int, ray_range: float) -> str:

@@ -141,10 +141,10 @@ class _TrainingRun:
             training_time=round(before + seconds + sum(earlier.seconds for earlier in self.evaluations), 1),
         )  # fmt: skip
         network = network_of(header, model, normalized)
-        outcome = evaluate_network(network, self._validation, VALIDATION_SEED)
+        success, travel_time, parts = evaluate_network(network, self._validation, VALIDATION_SEED)
         evaluation = Evaluation(
-            done + stage.steps, stage.num_robots, stage.scenario, outcome.success_rate, outcome.travel_time,
-            seconds, (making + robots.seconds) / seconds, parts=outcome.parts if settings.mixture else None,
+            done + stage.steps, stage.num_robots, stage.scenario, success, travel_time,
+            seconds, (making + robots.seconds) / seconds, parts=parts if settings.mixture else None,
         )  # fmt: skip
         self.evaluations = [*self.evaluations, evaluation]
         self._checkpoint = self.checkpoints.conclude(index, model, normalized, network, self.evaluations)

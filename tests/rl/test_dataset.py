@@ -158,7 +158,7 @@ def test_more_seeds_are_added_and_none_is_recorded_twice(tmp_path: Path, monkeyp
 
 
 def test_what_was_packed_just_before_a_crash_is_there_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(write_module.Recording, "forget", lambda self, seed: 1 / 0)
+    monkeypatch.setattr(write_module, "forget", lambda folder, seed: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         written(tmp_path / "one", shard_size=2)
     monkeypatch.undo()

@@ -25,7 +25,7 @@ from d4orm_env.core.seeds import checked_seeds
 from d4orm_env.disturbances.disturbance import Disturbance
 from d4orm_env.envs.team_step import TeamStep
 from d4orm_planners.base.episode import run_episode
-from d4orm_planners.base.planner_registry import PolicyLike, fresh_policy, origin, policy_settings
+from d4orm_planners.base.planner_registry import PolicyLike, called, fresh_policy, origin, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, Policy, robot_indices
 from d4orm_planners.evaluation.trials import Condition
 
@@ -86,8 +86,7 @@ class Demonstrations:
 
     @property
     def policy_name(self) -> str:
-        policy = self.policy
-        return policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
+        return called(self.policy)
 
     @cached_property
     def identity(self) -> dict[str, object]:

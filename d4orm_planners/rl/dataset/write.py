@@ -43,21 +43,13 @@ LIBRARIES = ("d4orm-env", "minari", "gymnasium", "numpy", "numba")
 Progress = Callable[[str, int, int], object]
 
 
-@dataclass(frozen=True)
-class Recording:
-    """Episodes in a folder, a file each, from when they end until they are in a dataset."""
+def _seeds(folder: Path, kind: str = _WHOLE) -> set[int]:
+    """Seeds of the episodes in a folder, a file each until they are in a dataset, or of those that were left out."""
+    return {int(path.stem) for path in folder.glob(f"*.{kind}") if path.stem.isdecimal()}
 
-    folder: Path
 
-    def seeds(self, kind: str = _WHOLE) -> set[int]:
-        """Seeds of the episodes that are there, or of those that have been left out."""
-        return {int(path.stem) for path in self.folder.glob(f"*.{kind}") if path.stem.isdecimal()}
-
-    def path(self, seed: int, kind: str = _WHOLE) -> Path:
-        return self.folder / f"{seed}.{kind}"
-
-    def forget(self, seed: int) -> None:
-        self.path(seed).unlink(missing_ok=True)
+def forget(folder: Path, seed: int) -> None:
+    (folder / f"{seed}.{_WHOLE}").unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
@@ -65,7 +57,7 @@ class _Task:
     """An episode to be recorded: a job with its seed, and what went wrong if anything did, as the only result."""
 
     demonstrations: Demonstrations
-    recording: Recording
+    folder: Path
     seed: int
     num_parts: int = 1
 
@@ -76,9 +68,9 @@ class _Task:
             yield self.seed, describe(error)
             return
         if self.demonstrations.only_success and not episode.success:
-            self.recording.path(self.seed, _DROPPED).touch()
+            (self.folder / f"{self.seed}.{_DROPPED}").touch()
         else:
-            episode.save(self.recording.path(self.seed))
+            episode.save(self.folder / f"{self.seed}.{_WHOLE}")
         yield self.seed, ""
 
     def lost(self, done: int, reason: str) -> tuple[list[tuple[int, str]], None]:
@@ -122,13 +114,13 @@ def write_dataset(
     name = checked_id(demonstrations.dataset_id if dataset_id is None else dataset_id)
     folder = dataset_folder(name) if out is None else checked_path(out, "the folder of a dataset")
     folder = folder.absolute()  # Minari takes no other
-    recording, files = Recording(folder / "recording"), dataset_files(demonstrations, folder / "data")
-    make_folder(recording.folder)
-    claim_folder(recording.folder / IDENTITY, demonstrations.identity, "a dataset")
-    with only_writer(recording.folder):
+    recording, files = folder / "recording", dataset_files(demonstrations, folder / "data")
+    make_folder(recording)
+    claim_folder(recording / IDENTITY, demonstrations.identity, "a dataset")
+    with only_writer(recording):
         _record(demonstrations, recording, files.seeds(), workers, progress or (lambda what, done, total: None))
         _pack(recording, files, shard_size)
-        files.write_main(_metadata(demonstrations, name, len(recording.seeds(_DROPPED))))
+        files.write_main(_metadata(demonstrations, name, len(_seeds(recording, _DROPPED))))
 
     return minari.MinariDataset(folder / "data")
 
@@ -170,12 +162,12 @@ def _spec(environment: Mapping[str, object]) -> EnvSpec | None:
 
 
 def _record(
-    demonstrations: Demonstrations, recording: Recording, packed: set[int], workers: int | None, progress: Progress
+    demonstrations: Demonstrations, recording: Path, packed: set[int], workers: int | None, progress: Progress
 ) -> None:
     """Record what is missing, by so many workers; at the end failed episodes are an error."""
-    for seed in packed & recording.seeds():  # packed just before it was broken off
-        recording.forget(seed)
-    existing, wanted = packed | recording.seeds() | recording.seeds(_DROPPED), list(demonstrations.seeds)
+    for seed in packed & _seeds(recording):  # packed just before it was broken off
+        forget(recording, seed)
+    existing, wanted = packed | _seeds(recording) | _seeds(recording, _DROPPED), list(demonstrations.seeds)
     tasks = [_Task(demonstrations, recording, seed) for seed in wanted if seed not in existing]
     done, size = len(wanted) - len(tasks), min(workers or available_cores(), len(tasks))
     progress("starting", done, len(wanted))
@@ -198,13 +190,13 @@ def _record(
         )
 
 
-def _pack(recording: Recording, files: DatasetFiles, shard_size: int) -> None:
-    seeds = sorted(recording.seeds())
+def _pack(recording: Path, files: DatasetFiles, shard_size: int) -> None:
+    seeds = sorted(_seeds(recording))
     for begin in range(0, len(seeds), shard_size):
         part = seeds[begin : begin + shard_size]
-        files.add_shard([RecordedEpisode.load(recording.path(seed)) for seed in part])
+        files.add_shard([RecordedEpisode.load(recording / f"{seed}.{_WHOLE}") for seed in part])
         for seed in part:
-            recording.forget(seed)
+            forget(recording, seed)
 
 
 def _metadata(demonstrations: Demonstrations, dataset_id: str, dropped: int) -> dict[str, object]:
