@@ -21,7 +21,7 @@ from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan, approach_goals
 from d4orm_planners.engine.sampling_types import SamplingTask, moving_robots
-from d4orm_planners.sampling.settings import GroupWeights
+from d4orm_planners.sampling.weights import GroupWeights
 
 if TYPE_CHECKING:
     from d4orm_planners.d4orm_d.planner import D4ormD

@@ -27,7 +27,7 @@ from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, ge
 from d4orm_planners.engine.score import score_kernel
 from d4orm_planners.hybrid.planner import Hybrid
 from d4orm_planners.mapf.planner import compile_path_finding
-from d4orm_planners.sampling.settings import SoftmaxWeights
+from d4orm_planners.sampling.weights import SoftmaxWeights
 from d4orm_planners.tracking.steering import at_rest, prepare_drives
 
 _RULES = SamplingRules(weights=SoftmaxWeights(1.0))

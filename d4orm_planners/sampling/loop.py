@@ -25,7 +25,8 @@ from d4orm_planners.base.planner import Iteration, Planner, State
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan, approach_goals
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
-from d4orm_planners.sampling.settings import DenoisingConfig, GroupWeights, SamplingConfig, alpha_bar
+from d4orm_planners.sampling.settings import DenoisingConfig, SamplingConfig, alpha_bar
+from d4orm_planners.sampling.weights import GroupWeights
 
 SHORT = 5.0  #: Length below which paths are short, in distances that two robots keep between their centres
 SLACK, SLACK_GROWTH = 2.0, 0.2  #: First horizon of the samples, in times of the drive, and its growth per iteration

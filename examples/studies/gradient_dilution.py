@@ -28,7 +28,8 @@ from examples.studies import AS_IN_THE_PAPER
 from d4orm_env import Problem, make_problem
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
 from d4orm_planners.evaluation.summary import mean_interval
-from d4orm_planners.sampling.settings import GroupWeights, SoftmaxWeights, annealed
+from d4orm_planners.sampling.settings import annealed
+from d4orm_planners.sampling.weights import GroupWeights, SoftmaxWeights
 
 Rows = list[dict[str, Any]]
 

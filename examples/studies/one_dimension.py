@@ -18,7 +18,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from examples.common import COLOURS, argument_parser, count, plt, save_figure, save_table
 
-from d4orm_planners.sampling.settings import SoftmaxWeights, annealed, constant
+from d4orm_planners.sampling.settings import annealed, constant
+from d4orm_planners.sampling.weights import SoftmaxWeights
 
 START = -2.5
 Objective: TypeAlias = Callable[[Any], Any]

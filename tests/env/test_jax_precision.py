@@ -28,7 +28,8 @@ from d4orm_planners import make_planner
 from d4orm_planners import reference as plain
 from d4orm_planners.engine.jax_sampling import JaxSamplingEngine
 from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingRules, SamplingTask
-from d4orm_planners.sampling.settings import EliteWeights, GroupWeights, SoftmaxWeights, annealed
+from d4orm_planners.sampling.settings import annealed
+from d4orm_planners.sampling.weights import EliteWeights, GroupWeights, SoftmaxWeights
 
 WALLS = World(
     2,

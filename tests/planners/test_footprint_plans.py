@@ -11,7 +11,7 @@ from d4orm_env.footprints import Box, Capsule, Ellipsoid
 from d4orm_planners import make_planner, make_policy, run_episode
 from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlan
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine, moving_robots
-from d4orm_planners.sampling.settings import SoftmaxWeights
+from d4orm_planners.sampling.weights import SoftmaxWeights
 
 
 def boxes(num_robots: int = 4, **changes: object) -> Problem:

@@ -22,7 +22,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_planners import reference as plain
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
-from d4orm_planners.sampling.settings import SoftmaxWeights
+from d4orm_planners.sampling.weights import SoftmaxWeights
 
 TEMPERATURE = 0.3
 RULES = SamplingRules(SoftmaxWeights(TEMPERATURE))

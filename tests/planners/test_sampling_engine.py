@@ -28,7 +28,8 @@ from d4orm_planners.engine.sampling_types import (
     get_sampling_engine,
 )
 from d4orm_planners.engine.score import score_kernel
-from d4orm_planners.sampling.settings import EliteWeights, SoftmaxWeights, annealed
+from d4orm_planners.sampling.settings import annealed
+from d4orm_planners.sampling.weights import EliteWeights, SoftmaxWeights
 
 CPU, JAX = CpuSamplingEngine(), JaxSamplingEngine()
 SOFTMAX = SamplingRules(SoftmaxWeights(0.3))

@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from d4orm_planners.sampling.settings import EliteWeights, GroupWeights, SoftmaxWeights, alpha_bar, annealed, constant
+from d4orm_planners.sampling.settings import alpha_bar, annealed, constant
+from d4orm_planners.sampling.weights import EliteWeights, GroupWeights, SoftmaxWeights
 
 PAPER_BETAS = (1e-4, 2e-2)
 

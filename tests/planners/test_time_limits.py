@@ -15,7 +15,7 @@ from d4orm_planners.base.planner_registry import PLANNERS
 from d4orm_planners.base.solve import SolveRun, Stopwatch
 from d4orm_planners.baselines.ipopt import ABANDONED, OUT_OF_TIME
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
-from d4orm_planners.sampling.settings import SoftmaxWeights
+from d4orm_planners.sampling.weights import SoftmaxWeights
 
 ALL = pytest.mark.parametrize("name", list_planners())
 LOOKS = 40
