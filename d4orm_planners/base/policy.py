@@ -166,27 +166,17 @@ def within_limits(problem: Problem, actions: Actions) -> Actions:
     return {agent: controls[robots[agent]] for agent in actions}
 
 
-class TeamFunction(Policy):
-    """A function ``(observations, state) -> actions`` as a policy."""
+class FunctionPolicy(Policy):
+    """A function ``(observations, state) -> actions``, or ``observation -> action`` of every robot by itself."""
 
-    def __init__(self, function: Callable[[Observations, FloatArray], Actions]) -> None:
-        self.function = function
-
-    def act(self, observations: Observations, state: FloatArray) -> Actions:
-        acting_robots(self, observations)
-        return within_limits(self.problem, self.function(observations, state))
-
-
-class RobotFunction(Policy):
-    """A function ``observation -> action`` as a policy: every robot asks it by itself."""
-
-    def __init__(self, function: Callable[[FloatArray], FloatArray]) -> None:
-        self.function = function
+    def __init__(self, function: Callable[..., Any], of_team: bool) -> None:
+        self.function, self.of_team = function, of_team
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
         acting_robots(self, observations)
-        actions = {agent: self.function(observation) for agent, observation in observations.items()}
-        return within_limits(self.problem, actions)
+        if self.of_team:
+            return within_limits(self.problem, self.function(observations, state))
+        return within_limits(self.problem, {agent: self.function(seen) for agent, seen in observations.items()})
 
 
 class OpenLoop(StatePolicy):
@@ -285,4 +275,4 @@ def as_policy(thing: Any, owner: str) -> Policy:
         if hasattr(thing, "forward"):
             remedy = "give it as from_torch(module), from d4orm_planners.base.adapters"
         raise ValueError(f"{owner} is {short_repr(thing)}, which does not act; {remedy}")
-    return TeamFunction(thing) if count == 2 else RobotFunction(thing)
+    return FunctionPolicy(thing, of_team=count == 2)

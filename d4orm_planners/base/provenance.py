@@ -29,6 +29,7 @@ llvm: Any = LazyModule("llvmlite.binding")
 numba_config: Any = LazyModule("numba.core")
 
 
+@cache
 def describe_machine() -> dict[str, object]:
     """Processor, its cores and how many of them are used, system, and version of Python.
 
@@ -99,12 +100,7 @@ class Provenance:
     def here(cls, preset: str | None, settings: Mapping[str, object]) -> Provenance:
         """Return that of a plan made by a planner with this preset and these settings here and now."""
         plain = json.loads(json.dumps(settings, default=str))
-        return cls(preset=preset, settings=plain, version=__version__, machine=_machine())
-
-
-@cache
-def _machine() -> dict[str, object]:
-    return describe_machine()
+        return cls(preset=preset, settings=plain, version=__version__, machine=describe_machine())
 
 
 def attributes(thing: object) -> dict[str, object]:
@@ -124,14 +120,9 @@ def attributes(thing: object) -> dict[str, object]:
         return _described(defaults | dict(inspect.getclosurevars(thing).nonlocals), thing)
     if isinstance(thing, type):
         return {}
-    return _described(_state(thing), thing)
-
-
-def _state(thing: object) -> dict[str, object]:
-    """Attributes of an instance, those in slots too."""
-    state = object.__getstate__(thing)
+    state = object.__getstate__(thing)  # and that of slots, if there are any
     parts = state if isinstance(state, tuple) else (state,)
-    return {name: value for part in parts if part for name, value in part.items()}
+    return _described({name: value for part in parts if part for name, value in part.items()}, thing)
 
 
 def _described(values: Mapping[str, object], owner: object) -> dict[str, object]:

@@ -126,7 +126,9 @@ class Study:
             if isinstance(scenario, Problem):
                 cells.append((scenario.name, [scenario] * len(seeds)))
             elif is_scenario_file(scenario):
-                problem = _load(Path(scenario))
+                problem = load_problem(scenario)
+                if problem.name == "custom":  # two files that give no name still differ
+                    problem = problem.replace(name=Path(scenario).stem)
                 cells.append((problem.name, [problem] * len(seeds)))
             else:
                 named = True
@@ -196,12 +198,6 @@ def _check_named_apart(cells: Sequence[tuple[str, list[Problem]]]) -> None:
                 f"two scenarios are called {name!r} and have {robots} robots, {'+'.join(models)}; give one another "
                 "name, as problem.replace(name='circle of 8 m'), or by name: in its file"
             )
-
-
-def _load(path: Path) -> Problem:
-    problem = load_problem(path)
-    # Two files that give no name still differ.
-    return problem.replace(name=path.stem) if problem.name == "custom" else problem
 
 
 def _several(values: T | Iterable[T], name: str = "") -> tuple[T, ...]:

@@ -23,7 +23,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import load_reference, source_digest
 from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.disturbance_registry import attributes_of, name_of
-from d4orm_planners.base.episode import Episode, open_env, run_episode
+from d4orm_planners.base.episode import open_env, run_episode
 from d4orm_planners.base.plan import IterationRecord, Plan
 from d4orm_planners.base.planner_registry import fresh_policy, is_planned, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, OpenLoop, Policy
@@ -171,9 +171,11 @@ def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, 
     metrics, plan = episode.metrics, policy.plan
     sent = {} if plan is None else plan.metrics
     stretch = episode.stretch if metrics["arrived"] else np.inf
+    report = verify(problem, episode.controls) if condition.replayable else None
     return {
         "success": bool(metrics["success"]),
-        **(_verdict(problem, episode) if condition.replayable else {}),
+        "verified": None if report is None else report.ok,
+        "violation": "" if report is None or report.ok else str(report.violations[0]),
         **{name: int(metrics[name]) for name in ("collided", "arrived", "steps")},
         **{name: float(metrics[name]) for name in ("travel_time", "makespan", "reward", "mean_squared_jerk")},
         "stretch": stretch if np.isfinite(stretch) else None,
@@ -186,11 +188,6 @@ def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, 
         "preparation": policy.preparation,
         "training_time": policy.training_time,
     }
-
-
-def _verdict(problem: Problem, episode: Episode) -> dict[str, object]:
-    report = verify(problem, episode.controls)
-    return {"verified": report.ok, "violation": "" if report.ok else str(report.violations[0])}
 
 
 def compact_history(history: tuple[IterationRecord, ...]) -> str:

@@ -212,7 +212,7 @@ class Viewport:
         self._observations, _ = self._env.set_state(states)
 
     def frame(self, status: Status) -> Frame:
-        joint = self._joint
+        joint, coarse = self._joint, getattr(self._policy, "guidance", None)
         return Frame(
             status=status,
             policy=self.name,
@@ -226,7 +226,7 @@ class Viewport:
             replanned=self._replanned,
             closest=nearest(self._scene, joint.states),
             plan=_plan(self._policy, joint.steps),
-            guidance=_guidance(self._policy),
+            guidance=None if coarse is None else np.asarray(coarse.path, np.float32),
             subgoals=getattr(self._policy, "subgoals", None),
             bodies=self._bodies,
         )
@@ -253,9 +253,3 @@ def _plan(policy: object, steps: int) -> FloatArray | None:
     if predicted is not None:
         return np.asarray(predicted, np.float32)
     return None if whole is None else np.asarray(whole.trajectory.positions[steps:], np.float32)
-
-
-def _guidance(policy: object) -> FloatArray | None:
-    """``(P, K, d)`` of a policy that follows a coarse plan."""
-    coarse = getattr(policy, "guidance", None)
-    return None if coarse is None else np.asarray(coarse.path, np.float32)

@@ -182,7 +182,10 @@ class Checkpoint:
                 getattr(buffer, name)[: len(filled)] = filled
             buffer.pos, buffer.full = int(numbers["replay_pos"]), bool(numbers["replay_full"])
         with _readable(self.folder):
-            self._set_parameters(model)
+            _, parameters, variables = load_from_zip_file(self.folder / "model.zip", device="cpu", load_data=False)
+            model.set_parameters(parameters, device="cpu")
+            for name, value in (variables or {}).items():
+                recursive_setattr(model, f"{name}.data", value.data)
 
     def _numbers(self, model: BaseAlgorithm, env: VecNormalize, fresh: bool) -> dict[str, np.ndarray]:
         """The arrays of ``state.npz`` that are wanted, none larger than the model and the environment have room for."""
@@ -199,12 +202,6 @@ class Checkpoint:
                 if not same or array.dtype != largest.dtype:
                     raise ValueError(f"{name} is {array.dtype} {array.shape}, not {largest.dtype} {largest.shape}")
         return numbers
-
-    def _set_parameters(self, model: BaseAlgorithm) -> None:
-        _, parameters, variables = load_from_zip_file(self.folder / "model.zip", device="cpu", load_data=False)
-        model.set_parameters(parameters, device="cpu")
-        for name, value in (variables or {}).items():
-            recursive_setattr(model, f"{name}.data", value.data)
 
 
 def _running(env: VecNormalize) -> dict[str, Any]:

@@ -17,14 +17,12 @@ from d4orm_planners.base.adapters import SharedPolicy, from_sb3
 from d4orm_planners.base.measured_states import acting_robots, stacked_observations
 from d4orm_planners.base.policy import Actions, Observations, Policy, within_limits
 from d4orm_planners.base.settings import CheckedSettings, PathText
-from d4orm_planners.rl.network import SUFFIX, Header, Network, load_network, range_sensors
+from d4orm_planners.rl.network import SUFFIX, Network, load_network, range_sensors
 from d4orm_planners.tracking.goal_drives import brake_to_dock
 from d4orm_planners.tracking.steering import goals_along_paths
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
-
-    from d4orm_env.core.world import World
 
 SHIPPED = Path(__file__).parent / "policies"
 SEEN_OBSTACLES = 4  #: Obstacles that the policies that come with the package see
@@ -99,8 +97,10 @@ class LearnedPolicy(Policy):
 
     def _choose(self, problem: Problem) -> None:
         """Act by the file for robots of the team's model in a world like this, or else by the nearest."""
-        files, model = self._files(self.config), problem.team.models[0]
-        walls = "-walls" if _paths_matter(problem.world) else ""
+        files, model, world = self._files(self.config), problem.team.models[0], problem.world
+        # More than a few round obstacles, all of which a robot sees: round those it finds by that.
+        paths_matter = len(world.boxes) + len(world.polygons) > 0 or world.num_obstacles > SEEN_OBSTACLES
+        walls = "-walls" if paths_matter else ""
         stems = (f"{self.name}-{model}{walls}", f"{self.name}-{model}", f"{self.name}{walls}")
         path = next((path for stem in stems if (path := SHIPPED / f"{stem}{SUFFIX}") in files), files[0])
         if path != self._path:
@@ -124,19 +124,16 @@ class LearnedPolicy(Policy):
             self._actor.reset(env, seed)
             return
         options = env.unwrapped.options
-        self._check_sensors(self._actor.header, range_sensors(options.observed_rays, options.ray_range))
-        self._seen_shape, self._layout = env.observation_space(env.possible_agents[0]).shape, env.unwrapped.layout
-        self._check_team(self._actor, self._seen_shape)
-        hiding = options.communication_range is not None or options.line_of_sight
-        self._detours = Detours(self.problem) if self.config.detours and not hiding else None
-
-    def _check_sensors(self, header: Header, given: str) -> None:
-        """Refuse other range sensors than those of the training; their numbers could pass for neighbours."""
-        if (trained := header.range_sensors) != given:
+        given, trained = range_sensors(options.observed_rays, options.ray_range), self._actor.header.range_sensors
+        if trained != given:  # whose numbers could pass for neighbours
             raise ValueError(
                 f"the policy in {self._path.name} was trained with {trained}, and this environment has {given}; make "
                 "it as in training"
             )
+        self._seen_shape, self._layout = env.observation_space(env.possible_agents[0]).shape, env.unwrapped.layout
+        self._check_team(self._actor, self._seen_shape)
+        hiding = options.communication_range is not None or options.line_of_sight
+        self._detours = Detours(self.problem) if self.config.detours and not hiding else None
 
     def _check_team(self, network: Network, observation_shape: tuple[int, ...]) -> None:
         """Refuse robots, and observations, of another kind than those of the training."""
@@ -192,11 +189,6 @@ class LearnedPolicy(Policy):
             return
         elsewhere = (heads != joint.goals).any(axis=1)[robots]
         seen[elsewhere, own] = (heads - positions)[robots][elsewhere]
-
-
-def _paths_matter(world: World) -> bool:
-    """Tell a world with more than a few round obstacles, all of which a robot sees: round those it finds by that."""
-    return len(world.boxes) + len(world.polygons) > 0 or world.num_obstacles > SEEN_OBSTACLES
 
 
 class PPO(LearnedPolicy):

@@ -66,14 +66,10 @@ def _shifted(
     """Points moved at random, by less from try to try until none are too close, and in the end not at all."""
     for tries in range(_TRIES):
         moved = points + random.uniform(-1, 1, points.shape) * shift * (1 - tries / _TRIES)
-        if _apart(moved, least):
+        gaps = np.linalg.norm(moved[:, None] - moved, axis=2) + np.diag(np.full(len(points), np.inf))
+        if gaps.min() >= least:
             return moved
     return points
-
-
-def _apart(points: NDArray[np.floating], least: float) -> bool:
-    gaps = np.linalg.norm(points[:, None] - points, axis=2) + np.diag(np.full(len(points), np.inf))
-    return bool(gaps.min() >= least)
 
 
 def _scattered(
