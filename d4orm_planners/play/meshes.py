@@ -79,14 +79,9 @@ def solid(
 
 def _prism(corners: NDArray[np.float64], tall: float) -> trimesh.Trimesh:
     """A polygon as a solid of some height."""
-    count, top = len(corners), np.array(triangulate(corners.astype(np.float32)))
-    ring = np.arange(count)
-    after = np.roll(ring, -1)
-    walls = np.concatenate(
-        [np.stack([ring, after, after + count], 1), np.stack([ring, after + count, ring + count], 1)]
-    )
-    vertices = np.concatenate([np.column_stack([corners, np.full(count, z)]) for z in (-tall / 2, tall / 2)])
-    return trimesh.Trimesh(vertices, np.concatenate([top, top + count, walls]), process=False)
+    middle, faces = np.eye(4), triangulate(corners.astype(np.float32))
+    middle[2, 3] = -tall / 2
+    return trimesh.creation.extrude_triangulation(corners, faces, tall, middle)
 
 
 def edges(bounds: Points) -> Points:
