@@ -14,7 +14,7 @@ import signal
 import sys
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
@@ -80,35 +80,27 @@ class OnceEach(TyperCommand):
         return super().parse_args(ctx, args)
 
 
-class LazyCommands(Mapping[str, Any]):
-    """The commands by name, each imported when it is looked up: help needs none of them."""
+class Commands(TyperGroup):
+    """The commands, each imported when it is looked up: help needs none of them.
 
-    def __getitem__(self, name: str) -> Any:
-        module, _, function = COMMANDS[name][0].partition(":")
+    A file that ends too early is an error, which Typer takes for the end of the user's input.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands: Any = COMMANDS  # whose names it lists and suggests
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, function = COMMANDS[cmd_name][0].partition(":")
         alone = typer.Typer(add_completion=False, rich_markup_mode=None)
-        alone.command(name, cls=OnceEach)(getattr(import_module(f"d4orm_planners.cli.{module}"), function))
+        alone.command(cmd_name, cls=OnceEach)(getattr(import_module(f"d4orm_planners.cli.{module}"), function))
         command = typer.main.get_command(alone)
         if not gc.isenabled():  # see d4orm_planners.cli.main
             gc.freeze()
             gc.enable()
         return command
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(COMMANDS)
-
-    def __len__(self) -> int:
-        return len(COMMANDS)
-
-
-class Commands(TyperGroup):
-    """The commands. A file that ends too early is an error, which Typer takes for the end of the user's input."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(**settings)
-        self.commands: Any = LazyCommands()
-
-    def list_commands(self, ctx: Any) -> list[str]:
-        return list(COMMANDS)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         with formatter.section("Commands"):
