@@ -136,10 +136,7 @@ def _compared(first: TrialGroup, second: TrialGroup) -> PairedPolicies | None:
     mean_slower, slower_lower, slower_upper = mean_interval(slower)
     trial = first.trials[0]
     return PairedPolicies(
-        scenario=trial.scenario,
-        num_robots=trial.num_robots,
-        model=trial.model,
-        control_noise_std=trial.control_noise_std,
+        **{name: getattr(trial, name) for name in ("scenario", "num_robots", "model", "control_noise_std")},
         disturbance=first.disturbance,
         level=first.level,
         first=first.label,

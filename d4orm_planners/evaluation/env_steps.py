@@ -70,16 +70,7 @@ def _measure_steps(settings: BenchmarkSettings, env: ParallelEnv, count: int) ->
         {agent: random.uniform(space.low, space.high).astype(np.float32) for agent in env.possible_agents}
         for _ in range(64)
     ]
-
-    def steps() -> None:
-        for index in range(count):
-            if not env.agents:
-                env.reset()
-            env.step(table[index % len(table)])
-
-    spread = measure(settings, steps)
-    env.close()
-    return spread.times(1 / count)
+    return _measure_table(settings, env, table, count)
 
 
 def measure_rooms(settings: BenchmarkSettings) -> Measurement:
@@ -100,15 +91,21 @@ def _measure_batch(settings: BenchmarkSettings, size: int, **options: Any) -> Sp
     low, high = space.low, space.high
     random = np.random.default_rng(0)
     table = [random.uniform(low, high, (size, *low.shape)).astype(np.float32) for _ in range(16)]
-    calls = max(1, settings.env_steps // 10)
+    return _measure_table(settings, env, table, max(1, settings.env_steps // 10)).times(1 / size)
+
+
+def _measure_table(settings: BenchmarkSettings, env: Any, actions: Sequence[object], count: int) -> Spread:
+    """Seconds per step of an environment under these actions, again and again; a batched one resets itself."""
 
     def steps() -> None:
-        for index in range(calls):
-            env.step(table[index % len(table)])
+        for index in range(count):
+            if not getattr(env, "agents", True):
+                env.reset()
+            env.step(actions[index % len(actions)])
 
     spread = measure(settings, steps)
     env.close()
-    return spread.times(1 / (calls * size))
+    return spread.times(1 / count)
 
 
 def measure_functional(settings: BenchmarkSettings) -> Measurement:
