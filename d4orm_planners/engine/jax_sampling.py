@@ -38,8 +38,7 @@ LOOK = 0.03  #: Seconds between looks at whether a run is to be stopped, if long
 
 AT_ONCE = 2**24
 """Discs whose rewards are computed at once, each of a robot, a sample and a step; of more, steps are taken in turn."""
-FOOTPRINT = 32
-"""Discs that a footprint counts as: its corners and edges are compared with those of others."""
+FOOTPRINT = 32  #: Discs that a footprint counts as: its corners and edges are compared with those of others
 
 
 class _Static(NamedTuple):

@@ -43,7 +43,7 @@ class PathIndex:
         scale = 1 / (2 * safety_distance)
         #: The index as kernels read it
         self.table = PathTable(
-            BLOCK, positions, np.zeros((num_blocks, num_robots, BLOCK, positions.shape[2]), np.float32), radii,
+            positions, np.zeros((num_blocks, num_robots, BLOCK, positions.shape[2]), np.float32), radii,
             np.float64(margin), np.float64(safety_distance), np.float64(scale), np.float64(flattening),
             np.zeros((num_blocks, num_robots, 3)), np.zeros((num_blocks, num_robots)),
             np.zeros(1), np.zeros(1, np.int64),

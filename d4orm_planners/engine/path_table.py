@@ -22,7 +22,6 @@ _WIDER = 1 + 2.0**-20  #: Factor by which distances up to which there may be a r
 class PathTable(NamedTuple):
     """The index as kernels read it. Steps are counted from the first after the start."""
 
-    block: int  #: :data:`BLOCK`
     positions: FloatArray  #: ``(H+1, K, d)`` float32 [m]
     blocks: FloatArray  #: ``(B, K, BLOCK, d)`` the same, those of a robot in a block side by side
     radius: Floats  #: ``(K,)`` float64 [m]
@@ -194,8 +193,7 @@ def count_near(table: PathTable, robot: Whole, exclude: IntArray, path: FloatArr
     return count
 
 
-Box: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float]]
-"""Lowest and highest corner [m]."""
+Box: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float]]  #: Lowest and highest corner [m]
 
 
 class Nearby(NamedTuple):

@@ -23,8 +23,7 @@ from d4orm_planners.manoeuvres.snapping import Goal
 
 SWEEPS, PASSES = 4, 6
 """Rounds in which a gap is closed, and in which controls are found that the least change would bring beyond bounds."""
-EXACT = 0.5
-"""Share of the goal's tolerances within which a gap is closed."""
+EXACT = 0.5  #: Share of the goal's tolerances within which a gap is closed
 DIFFERENCE, RIDGE = 1e-4, 1e-9
 """Difference by which derivatives are taken, and share of the normal equations' trace added to their diagonal."""
 

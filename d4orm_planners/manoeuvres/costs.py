@@ -26,10 +26,8 @@ from d4orm_planners.manoeuvres.lattice import (
 from d4orm_planners.manoeuvres.primitives import Primitives, primitives_of
 from d4orm_planners.manoeuvres.snapping import Goal
 
-NEAR = 4
-"""Cells of the usual size from a start or a goal as far as which finer ones are."""
-LATER = 20
-"""Steps by which a detour over a pose may be longer than the shortest path for its cost to be worked out."""
+NEAR = 4  #: Cells of the usual size from a start or a goal as far as which finer ones are
+LATER = 20  #: Steps by which a detour over a pose may be longer than the shortest path for its cost to be worked out
 TEAM_CELLS, LEAST_CELLS, MOST_CELLS = 4_000_000, 150_000, 400_000
 """Cells of the costs of all robots together, and the least and the most of one: a larger world has larger cells."""
 

@@ -25,11 +25,9 @@ from d4orm_planners.manoeuvres.lattice import TURN, moved, turned_by, write_pose
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE, drive
 from d4orm_planners.manoeuvres.snapping import Goal
 
-LEVELS = (1.0, 0.5, 0.25, 0.125)
-"""Curvatures, in that of the tightest circle."""
+LEVELS = (1.0, 0.5, 0.25, 0.125)  #: Curvatures, in that of the tightest circle
 SIDES = (1, -1)
-CIRCLES = len(LEVELS) * len(SIDES)
-"""Circles in each direction."""
+CIRCLES = len(LEVELS) * len(SIDES)  #: Circles in each direction
 
 
 class Curves(NamedTuple):

@@ -12,26 +12,19 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import ACCELERATION, PYTHON_OPS, SPEED, Model, TimeStep
 
-SECTORS = 32
-"""Number of headings that are told apart."""
-SECTOR = 2 * pi / SECTORS
-"""Angle between two of them [rad]."""
-FINER_SECTORS = 4 * SECTORS
-"""The number where cells are finest."""
-LENGTHS = (1.5, 6.0)
-"""Lengths of straight primitives, in cells."""
-MAX_STEPS = 2**14
-"""Most steps of a move."""
+SECTORS = 32  #: Number of headings that are told apart
+SECTOR = 2 * pi / SECTORS  #: Angle between two of them [rad]
+FINER_SECTORS = 4 * SECTORS  #: The number where cells are finest
+LENGTHS = (1.5, 6.0)  #: Lengths of straight primitives, in cells
+MAX_STEPS = 2**14  #: Most steps of a move
 
 OPS = PYTHON_OPS._replace(
     cos=lambda x: portable.sin_cos_of(x)[1],
     sin=lambda x: portable.sin_cos_of(x)[0],
 )
 
-Mode = tuple[float, ...]
-"""Components of a state beside position and heading: speeds, steering and hitch angles."""
-Move = tuple[Mode, Mode, FloatArray]
-"""Mode before, mode after, and ``(n, m)`` controls."""
+Mode = tuple[float, ...]  #: Components of a state beside position and heading: speeds, steering and hitch angles
+Move = tuple[Mode, Mode, FloatArray]  #: Mode before, mode after, and ``(n, m)`` controls
 State = tuple[float, ...]
 
 

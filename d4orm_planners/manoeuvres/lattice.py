@@ -17,8 +17,7 @@ from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 
 TURN = 2 * np.pi
 
-Pose: TypeAlias = tuple[float, float, float, float, float, float]
-"""Position, heading and hitch angles."""
+Pose: TypeAlias = tuple[float, float, float, float, float, float]  #: Position, heading and hitch angles
 
 
 def buffer_size(footprints: FootprintArrays) -> int:

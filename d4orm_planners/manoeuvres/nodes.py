@@ -27,8 +27,7 @@ from d4orm_planners.manoeuvres.lattice import (
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE, Primitives
 from d4orm_planners.manoeuvres.snapping import CURVING, Goal, Limits, snap_of, snap_pose, snap_steps
 
-AHEAD, BEHIND = -2, -3
-"""Moves that are no primitives: the last stretch, forwards and backwards."""
+AHEAD, BEHIND = -2, -3  #: Moves that are no primitives: the last stretch, forwards and backwards
 
 
 class Nodes(NamedTuple):

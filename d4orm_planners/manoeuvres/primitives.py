@@ -26,8 +26,7 @@ from d4orm_planners.manoeuvres.sideways_moves import holonomic2d_jerk_moves, hol
 
 POSE_SIZE = 3 + MOST_TRAILERS
 """Numbers of a pose: position, heading and hitch angles, zero for those that there are not."""
-TURNS = (1, 2)
-"""Sectors by which an arc turns, to either side."""
+TURNS = (1, 2)  #: Sectors by which an arc turns, to either side
 TURNS_ON_THE_SPOT = (1, 4)
 
 

@@ -23,21 +23,17 @@ from d4orm_planners.manoeuvres.nodes import Task
 from d4orm_planners.manoeuvres.primitives import MOVES, POSE_SIZE, primitives_of
 from d4orm_planners.manoeuvres.snapping import CURVING, NOWHERE, SIDEWAYS, TURNING, Goal, Limits
 
-CELLS_PER_RADIUS = 3
-"""Cells in the outer radius of the largest robot."""
-ROOM = 4
-"""Room round starts and goals in a world without bounds, in diameters of the largest robot."""
+CELLS_PER_RADIUS = 3  #: Cells in the outer radius of the largest robot
+ROOM = 4  #: Room round starts and goals in a world without bounds, in diameters of the largest robot
 CLEARANCE = 0.15
 """Distance kept from everything beyond the margin, in what the fastest robot drives in a step: what is between the
 poses that are checked is near to these."""
 CUTTING = 0.7
 """Depth to which a corner may get into another between two checked poses, as a share of the fastest stride."""
-MAX_PARTS = 8
-"""Most poses that are looked at in a step."""
+MAX_PARTS = 8  #: Most poses that are looked at in a step
 CERTAIN = 0.98
 """Share of a goal's radius, heading tolerance and speed within which a robot is at its goal beyond doubt."""
-WEIGHT = 1.5
-"""Factor by which the steps ahead of a node count more than those behind it."""
+WEIGHT = 1.5  #: Factor by which the steps ahead of a node count more than those behind it
 DEPARTURE_INTERVAL = 0.7
 """Time between departures that are tried, as a share of that in which the fastest robot drives the radius of the
 largest one."""

@@ -25,8 +25,7 @@ ROUNDS, FIRST_ROUNDS, FIRST_PER_ROBOT = 400, 50, 4
 """Neighbourhoods that are replanned to find a motion for everybody; the most at first, and of a small team so many for
 each robot. From then on every other one has late departures, and every other one detours, where robots have to let each
 other by somewhere that is on nobody's way: which of them leads on is not known."""
-BETTER_ROUNDS = 16
-"""Neighbourhoods that are replanned in an iteration once everybody has one."""
+BETTER_ROUNDS = 16  #: Neighbourhoods that are replanned in an iteration once everybody has one
 
 
 def compile_manoeuvres(models: tuple[str, ...]) -> None:

@@ -40,8 +40,7 @@ from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meeting, safe_sinc
 
 NOTHING, PAUSED = -1, -2
 """Results of a search that ends without a motion, and of one that is to go on if there is time."""
-NODES_PER_CALL = 2000
-"""Nodes that a call follows before it asks its caller whether there is time."""
+NODES_PER_CALL = 2000  #: Nodes that a call follows before it asks its caller whether there is time
 SHORT, EVERY = 40, 8
 """Longest last stretch that every node tries [steps]; and of which nodes, every so-manyth, longer ones are tried."""
 

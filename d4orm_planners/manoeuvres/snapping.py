@@ -14,8 +14,7 @@ from d4orm_planners.manoeuvres.lattice import turned_by
 NOWHERE, TURNING, SIDEWAYS, CURVING = range(4)
 """Robots that cannot turn on the spot and have no last stretch; those that can; those that need not; and first-order
 cars, whose last stretch is in :mod:`~d4orm_planners.manoeuvres.curves`."""
-NEAR = 1e-3
-"""Distance from the goal that needs no drive, as a share of the goal radius."""
+NEAR = 1e-3  #: Distance from the goal that needs no drive, as a share of the goal radius
 
 
 class Limits(NamedTuple):

@@ -25,13 +25,11 @@ from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meets_nobody, traf
 from d4orm_planners.mapf.lns import Odds
 from d4orm_planners.tracking.steering import advanced
 
-MAX_NODES = 100_000
-"""Nodes after which a search gives up, ..."""
+MAX_NODES = 100_000  #: Nodes after which a search gives up, ...
 FIRST_NODES = 400_000
 """... and among others at first a robot's share of so many, once more after every four searches of each: in a large
 team it is quicker to change others' motions."""
-DETOUR_NODES = MAX_NODES // 5
-"""Nodes of which one is drawn for a robot to go to first."""
+DETOUR_NODES = MAX_NODES // 5  #: Nodes of which one is drawn for a robot to go to first
 CELLS = (1.0, 0.8, 0.6)
 """Sizes of cells that are tried in turn for a robot alone, as shares of the usual one: whether poses that count as one
 leave a way through a tight place is chance."""

@@ -13,8 +13,7 @@ from d4orm_env.engine.convex_cores import cores_within, place_body
 from d4orm_env.engine.simd import TILE
 from d4orm_planners.manoeuvres.lattice import Pose, RobotBody, hitch_of, placed_first, placed_next, pose_between
 
-NEVER = 1 << 40
-"""Step that never comes."""
+NEVER = 1 << 40  #: Step that never comes
 
 
 class Traffic(NamedTuple):

@@ -29,14 +29,11 @@ from d4orm_planners.tracking.tracker import velocity_step
 _INFINITE = np.float32(np.inf)
 _STATE, _CONTROL, _AIM, _PACE, _ARRIVED, _END, _VELOCITY, _LOW, _HIGH, _POSITIONS = 0, 6, 10, 13, 14, 15, 16, 19, 22, 25
 """First rows of the workspace; the positions of a block's steps are the last."""
-LANES = (_POSITIONS + 3 * BLOCK) * TILE
-"""Size of the workspace of a tile."""
+LANES = (_POSITIONS + 3 * BLOCK) * TILE  #: Size of the workspace of a tile
 
-_AHEAD = np.float32(0.5)
-"""Distance ahead of a robot from which the rest of its path is measured [s]."""
+_AHEAD = np.float32(0.5)  #: Distance ahead of a robot from which the rest of its path is measured [s]
 
-_TOUCH = 100.0
-"""Robots that are met rather than an obstacle touched for a step."""
+_TOUCH = 100.0  #: Robots that are met rather than an obstacle touched for a step
 
 BlockDriver: TypeAlias = Callable[
     [ProblemArrays, Whole, Moves, Beam, Whole, Whole, Whole, Whole, FloatArray, Floats], None

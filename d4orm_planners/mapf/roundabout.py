@@ -28,7 +28,6 @@ CORRECTION = 1.0  #: Share of its distance from where it should be that a robot 
 class Bends(NamedTuple):
     """Paths of a line, an arc and a line."""
 
-    begin: Floats  #: ``(K, 2)`` where they begin [m]
     centre: Floats  #: ``(K, 2)`` of the arcs [m]
     radius: Floats  #: ``(K,)`` of the arcs [m]
     first: Floats  #: ``(K,)`` length of the lines up to the arcs [m]
@@ -108,7 +107,7 @@ def _bends(problem: Problem, side: int) -> Bends | None:
     # To the left of the middle is clockwise round it.
     first, last = turns[0] - side * spread[0], turns[1] + side * spread[1]
     angle = -side * np.mod(-side * (last - first), 2 * np.pi)
-    return Bends(begin, centre, bend, straight[0], np.stack([first, angle], axis=1))
+    return Bends(centre, bend, straight[0], np.stack([first, angle], axis=1))
 
 
 def _nearest_to_all(positions: Floats, normals: Floats) -> Floats | None:
