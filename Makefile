@@ -83,7 +83,7 @@ format: $(DEV_STAMP) ## Format the code and mend what ruff can
 	$(BIN)/ruff format .
 
 clean: ## Remove what the targets above made, .venv included
-	rm -rf $(VENV)* demo bench docs/_build docs/_extra docs/reference build dist \
+	rm -rf $(VENV)* demo bench docs/_build docs/_extra docs/reference/settings.md docs/reference/d4orm_* build dist \
 	  .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 
 # Debian's Python may come without ensurepip; its own pip then puts one into the environment.

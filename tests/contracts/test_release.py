@@ -103,3 +103,11 @@ def test_the_packages_are_in_the_policy() -> None:
 
 def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 80
+
+
+def test_make_clean_removes_nothing_of_the_repository() -> None:
+    removed = subprocess.run(["make", "--dry-run", "clean"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    folders = [name for name in removed.replace("\\\n", " ").split() if name not in ("rm", "-rf", ".venv*")]
+    assert "docs/_build" in folders
+    kept = subprocess.run(["git", "ls-files", *folders], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert not kept
