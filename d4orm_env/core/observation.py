@@ -1,6 +1,7 @@
 """Observation of one robot: itself, its goal, its nearest neighbours and the nearest obstacles.
 
-:func:`observe_robot` is written with plain loops over small arrays, so that the CPU engine compiles it as it stands.
+:func:`observe_robot` and :func:`observe_obstacles` are plain loops over small arrays, so that the CPU engine compiles
+them as they stand.
 All vectors are in the world's frame, relative to the robot, in SI units.
 """
 
@@ -10,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.geometry.world_index import WIDER, WorldIndex
 
@@ -35,20 +36,25 @@ class Sensed(NamedTuple):
 
 def observe_robot(
     k: int, arrays: ProblemArrays, goal: FloatArray, sensed: Sensed, time_left: float | np.float32, out: FloatArray
-) -> None:
-    """Fill robot ``k``'s observation ``(D,)``, as :class:`~d4orm_env.core.observation_layout.ObservationSlices` says.
+) -> int:
+    """Fill robot ``k``'s observation ``(D,)``, as :class:`~d4orm_env.core.observation_layout.ObservationSlices` says,
+    up to the component that is returned, where obstacles begin.
 
     ``time_left`` is the share of the time left, 1 to 0.
     """
     d = goal.shape[1]
     neighbors = 2 * d + 8 + _see_goal_heading(k, arrays.goal_direction, sensed.heading, 2 * d + 8, out)
-    obstacles = neighbors + (2 + 2 * d) * sensed.nearest_robots.shape[0]
     _see_itself(k, arrays, goal, sensed, out)
     out[2 * d + 3] = time_left
     _find_nearest_robots(k, sensed.position, sensed.hidden, sensed.nearest_robots)
     _see_robots(k, sensed, neighbors, out)
+    return neighbors + (2 + 2 * d) * sensed.nearest_robots.shape[0]
+
+
+def observe_obstacles(k: int, arrays: ProblemArrays, sensed: Sensed, first: Whole, out: FloatArray) -> None:
+    """Fill robot ``k``'s observation ``(D,)`` from component ``first`` on, where obstacles begin."""
     _find_nearest_obstacles(sensed.position[k], arrays, sensed.nearest_obstacles)
-    _see_obstacles(sensed.position[k], arrays, arrays.wall_radius[k], sensed.nearest_obstacles, obstacles, out)
+    _see_obstacles(sensed.position[k], arrays, arrays.wall_radius[k], sensed.nearest_obstacles, first, out)
 
 
 def _see_itself(k: int, arrays: ProblemArrays, goal: FloatArray, sensed: Sensed, out: FloatArray) -> None:
@@ -96,7 +102,7 @@ def _see_robots(k: int, sensed: Sensed, i: int, out: FloatArray) -> None:
 
 
 def _see_obstacles(
-    position: FloatArray, arrays: ProblemArrays, radius: float, nearest: FloatArray, i: int, out: FloatArray
+    position: FloatArray, arrays: ProblemArrays, radius: float, nearest: FloatArray, i: Whole, out: FloatArray
 ) -> None:
     """Fill the rows of obstacles, from component ``i`` on."""
     d = position.shape[0]

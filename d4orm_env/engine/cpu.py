@@ -30,6 +30,7 @@ from d4orm_env.engine.observing import (
     allocate_scratch,
     observe_world,
     observe_worlds,
+    see_obstacles,
 )
 from d4orm_env.engine.ray_casting import Surroundings, cast_rays
 from d4orm_env.engine.simd import TILE
@@ -88,8 +89,10 @@ def _units(arrays: ProblemArrays, closed: bool, view: ObservationSpec | None) ->
     units.append((path_of(mark_static), (problem, numba.uint64, numba.float32, lines, near)) if closed else None)
     if view is not None:
         table = numba.float32[:, ::1]
-        kinds = problem, table, numba.float32, borrowed(view), SENSED_TYPES, table
+        kinds = problem, table, numba.float32, borrowed(view), SENSED_TYPES, table, addresses
         units.append((path_of(observe_world), kinds))
+        kinds = problem, SENSED_TYPES, numba.int64, table
+        units.append((path_of(see_obstacles), kinds) if closed else None)
         kinds = problem, numba.int64, numba.int64, lines, rows
         units += [(path_of(robot_unit, name), kinds) for name in names_of_codes(arrays.model_codes)]
     return units

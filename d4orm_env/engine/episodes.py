@@ -177,9 +177,8 @@ def advance_worlds(
             _close_step(batch, orders[b], max_cycles, b, b - first, w)
             if out.shape[0] > 0:
                 sense_robots(arrays, batch.arrived[b], b - first, w, motion, sensed)
-                call_observe_world(
-                    units[OBSERVATION], arrays, batch.goal[b], _time_left(batch, max_cycles, b), view, sensed, out[b]
-                )
+                time_left = _time_left(batch, max_cycles, b)
+                call_observe_world(units[OBSERVATION], arrays, batch.goal[b], time_left, view, sensed, out[b], units)
 
 
 RollOut: TypeAlias = Kernel[

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core import observation
-from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, Whole
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
@@ -20,7 +20,7 @@ from d4orm_env.engine.ray_shapes import is_blocked
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.tiles import STATE, STRIDE, TeamBoxes, allocate_boxes, call_robot, pose_rows
 from d4orm_env.engine.types import ObservationInputs
-from d4orm_env.engine.units import OBSERVATION, ROBOTS, UNIT, caller
+from d4orm_env.engine.units import OBSERVATION, ROBOTS, SEEN_OBSTACLES, UNIT, caller
 from d4orm_env.engine.world_tiles import load
 
 register(observation)
@@ -127,27 +127,46 @@ def _sense_bodies(bodies: FloatArray, num_robots: int, sensed: observation.Sense
 
 
 @cached_kernel(**UNIT)
+def see_obstacles(arrays: ProblemArrays, sensed: observation.Sensed, first: Whole, out: FloatArray) -> None:
+    """Fill ``out`` ``(K, D)`` from column ``first`` on with the obstacles that the robots of a world see.
+
+    A unit of its own, which is not compiled until a problem has obstacles or bounds.
+    """
+    for k in range(out.shape[0]):
+        observation.observe_obstacles(k, arrays, sensed, first, out[k])
+
+
+_call_see_obstacles = caller(4)
+
+
+@cached_kernel(**UNIT)
 def observe_world(
     arrays: ProblemArrays, goal: FloatArray, time_left: np.float32, view: ObservationSpec,
-    sensed: observation.Sensed, out: FloatArray,
+    sensed: observation.Sensed, out: FloatArray, units: IntArray,
 ) -> None:  # fmt: skip
-    """Fill ``out`` ``(K, D)`` with what the robots of a world see, inside the view's bounds."""
-    bounds = view.bounds
+    """Fill ``out`` ``(K, D)`` with what the robots of a world see, inside the view's bounds.
+
+    It calls one of ``units``, their addresses, if it is there.
+    """
+    bounds, closed = view.bounds, units[SEEN_OBSTACLES, 0] != 0
+    first: Whole = np.int64(0)
     for k in range(goal.shape[0]):
-        row = out[k]
         if view.line_of_sight is not None or view.squared_range < np.inf:
             _hide(
                 sensed.position[k], sensed.position, arrays.boxes, arrays.triangles, view.squared_range,
                 view.line_of_sight, sensed.ray, sensed.hidden,
             )  # fmt: skip
-        observation.observe_robot(k, arrays, goal, sensed, time_left, row)
-        for i in range(row.shape[0]):
-            value = row[i]
+        first = observation.observe_robot(k, arrays, goal, sensed, time_left, out[k])
+    if closed:
+        _call_see_obstacles(units[SEEN_OBSTACLES], arrays, sensed, first, out)
+    for k in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            value = out[k, i] if closed or i < first else ZERO
             value = value if value > bounds[0, i] else bounds[0, i]
-            row[i] = value if value < bounds[1, i] else bounds[1, i]
+            out[k, i] = value if value < bounds[1, i] else bounds[1, i]
 
 
-call_observe_world = caller(6)
+call_observe_world = caller(7)
 """``(address, *arguments)``: call :func:`observe_world` as a unit."""
 
 
@@ -205,4 +224,6 @@ def observe_worlds(
         for b in range(first, first + count):
             _sense_bodies(sight.bodies[b], num_robots, sensed)
             sense_robots(arrays, sight.arrived[b], b - first, w, motion, sensed)
-            call_observe_world(units[OBSERVATION], arrays, sight.goal[b], sight.time_left[b], view, sensed, out[b])
+            call_observe_world(
+                units[OBSERVATION], arrays, sight.goal[b], sight.time_left[b], view, sensed, out[b], units
+            )

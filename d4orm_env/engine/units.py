@@ -26,7 +26,7 @@ from d4orm_env.engine.compiling import WITHOUT_ARRAYS
 from d4orm_env.engine.simd import Instructions, intrinsic
 from d4orm_env.engine.threads import available_cores
 
-CONTACTS, OBSTACLES, OBSERVATION, ROBOTS = range(4)
+CONTACTS, OBSTACLES, OBSERVATION, SEEN_OBSTACLES, ROBOTS = range(5)
 """Rows of the addresses that kernels of worlds get; those of the robots' models come last."""
 Types: TypeAlias = tuple[types.Type, ...]
 """Types of a kernel's arguments."""

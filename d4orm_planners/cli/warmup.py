@@ -97,7 +97,8 @@ def _step_environments() -> None:
         env.step(dict.fromkeys(env.agents, zero))
         env.close()
 
-    vector_env = make_vec("d4orm/Navigation-v0", num_envs=2, vectorization_mode="vector_entry_point", num_robots=2)
+    arguments = {"scenario": "doorway", "num_robots": 4}  # obstacles are seen by a kernel of their own
+    vector_env = make_vec("d4orm/Navigation-v0", num_envs=2, vectorization_mode="vector_entry_point", **arguments)
     vector_env.reset(seed=0)
     vector_env.step(np.zeros(vector_env.action_space.shape, np.float32))
     vector_env.close()

@@ -52,9 +52,10 @@ def compile_for_planning(planner: Planner, problem: Problem, announce: Callable[
         spread_waves()
         drive_once(models)
     elif planner.drives_straight:
-        other = in_another_process(f"drive_once({models!r}, {planner.name!r})")
+        samples, call = _samples_first(planner, problem), f"drive_once({models!r}, {planner.name!r})"
+        other = in_another_process(f"{call}; average_once({models!r})" if samples else call)
         index_paths(models)
-        if _samples_first(planner, problem):
+        if samples:
             sample_once((models,))
     else:
         other = in_another_process(f"average_once({models!r}); roll_out_once({models!r})")

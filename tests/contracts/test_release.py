@@ -106,8 +106,11 @@ def test_the_readme_is_short() -> None:
 
 
 def test_make_clean_removes_nothing_of_the_repository() -> None:
-    removed = subprocess.run(["make", "--dry-run", "clean"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    folders = [name for name in removed.replace("\\\n", " ").split() if name not in ("rm", "-rf", ".venv*")]
+    def output(*command: str) -> str:
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+    folders = [
+        name for name in output("make", "--dry-run", "clean").split() if name not in ("rm", "-rf", "\\", ".venv*")
+    ]
     assert "docs/_build" in folders
-    kept = subprocess.run(["git", "ls-files", *folders], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    assert not kept
+    assert not output("git", "ls-files", *folders)

@@ -13,7 +13,7 @@ from env_support import mixed_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d4orm_env.core.observation import Sensed, _gap_to_triangle, insert_nearest, observe_robot
+from d4orm_env.core.observation import Sensed, _gap_to_triangle, insert_nearest, observe_obstacles, observe_robot
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
@@ -317,7 +317,8 @@ def test_the_plain_function_and_the_compiled_one_agree(goal_heading: Any) -> Non
         np.empty((3, 2)),
     )
     for k in range(3):
-        observe_robot(k, problem.arrays, problem.goal, sensed, 0.5, plain[k])
+        first = observe_robot(k, problem.arrays, problem.goal, sensed, 0.5, plain[k])
+        observe_obstacles(k, problem.arrays, sensed, first, plain[k])
     np.testing.assert_allclose(np.clip(plain, layout.low, layout.high), compiled, atol=1e-6)
 
 
