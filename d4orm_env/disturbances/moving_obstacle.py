@@ -16,6 +16,7 @@ from d4orm_env.core.arrays import (
     LARGEST,
     FloatArray,
     Floats,
+    Frozen,
     IntArray,
     frozen_array,
     positive_number,
@@ -137,7 +138,7 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class MovingObstacle(_Bodies[Kept]):
+class MovingObstacle(Frozen, _Bodies[Kept]):
     """A body, disc or ball, or several, on a given trajectory: it meets robots as an :class:`Intruder` does.
 
     Between the times it moves on straight lines. It is absent before the first time and after the last, and where its
@@ -171,19 +172,7 @@ class MovingObstacle(_Bodies[Kept]):
             raise ValueError(f"MovingObstacle positions must be at most {LARGEST:g} m in magnitude, or NaN")
         for row in positions[np.isnan(positions).any(axis=2) & ~np.isnan(positions).all(axis=2)][:1]:
             raise ValueError(f"MovingObstacle position {row.tolist()} is half NaN; give all of it, or NaN for absent")
-        for name, value in {"times": times, "positions": positions}.items():
-            object.__setattr__(self, name, value)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, MovingObstacle) and self._content == other._content
-
-    def __hash__(self) -> int:
-        return hash(self._content)
-
-    @property
-    def _content(self) -> tuple[object, ...]:
-        times, positions = self._track
-        return times.tobytes(), positions.shape, positions.tobytes(), self.radius
+        self._set(times=times, positions=positions)
 
     @property
     def _track(self) -> tuple[Floats, Floats]:
