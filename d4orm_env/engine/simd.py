@@ -51,7 +51,7 @@ _BITS = ir.IntType(CHUNK)
 _MASK = ir.IntType(TILE)
 
 
-class _Writer(NamedTuple):
+class Writer(NamedTuple):
     """The function whose instructions are written, and what most of them do. Arrays are given by argument number."""
 
     context: BaseContext
@@ -92,23 +92,23 @@ class _Writer(NamedTuple):
         return self.builder.fcmp_ordered("<=", values, bound)
 
 
-_ARRAY = None
-"""In place of the type of an argument that is an array of whatever layout."""
+ANY = None
+"""In place of the type of an argument that may have any, as an array of whatever layout."""
 
 
-def _instructions(result: Type, *kinds: Type | None) -> Callable[[Callable[[_Writer], Value]], Callable[..., Any]]:
+def instructions(result: Type, *kinds: Type | None) -> Callable[[Callable[[Writer], Value]], Callable[..., Any]]:
     """Decorator: what ``write(writer)`` writes as a function of compiled code with arguments of these types."""
 
-    def decorate(write: Callable[[_Writer], Value]) -> Callable[..., Any]:
+    def decorate(write: Callable[[Writer], Value]) -> Callable[..., Any]:
         @wraps(write)
         def define(typing_context: TypingContext, *given: Type) -> Instructions:
             def generate(
                 context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]
             ) -> Value:
-                value = write(_Writer(context, builder, signature, arguments))
+                value = write(Writer(context, builder, signature, arguments))
                 return context.get_dummy_value() if value is None else value
 
-            return result(*(own if kind is _ARRAY else kind for own, kind in zip(given, kinds, strict=True))), generate
+            return result(*(own if kind is ANY else kind for own, kind in zip(given, kinds, strict=True))), generate
 
         names = ("typing_context", *(f"argument_{number}" for number in range(len(kinds))))
         parameters = [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in names]
@@ -123,8 +123,8 @@ def _within(dimension: int, count: int) -> Callable[..., np.uint64]:
     near, in the first ``count`` worlds.
     """
 
-    @_instructions(uint64, _ARRAY, int64, int64, float32)
-    def within(writer: _Writer) -> Value:
+    @instructions(uint64, ANY, int64, int64, float32)
+    def within(writer: Writer) -> Value:
         _, a, b, squared_distance = writer.arguments
         bound = writer.splat(squared_distance)
 
@@ -146,8 +146,8 @@ within_2, within_3 = _within(2, TILE), _within(3, TILE)
 chunk_within_2, chunk_within_3 = _within(2, CHUNK), _within(3, CHUNK)
 
 
-@_instructions(void, _ARRAY, int64, int64, float32, _ARRAY, int64)
-def enclose(writer: _Writer) -> None:
+@instructions(void, ANY, int64, int64, float32, ANY, int64)
+def enclose(writer: Writer) -> None:
     """``(w, first, step, widening, boxes, begin)``: enclose the numbers of ``BLOCK`` rows, the first at ``w[first]``
     and the others ``step`` numbers apart.
 
@@ -183,8 +183,8 @@ def _overlap(dimension: int, width: int, begin: int) -> Callable[..., np.uint64]
     lanes of :func:`enclose`.
     """
 
-    @_instructions(uint64, _ARRAY, int64, int64)
-    def overlap(writer: _Writer) -> Value:
+    @instructions(uint64, ANY, int64, int64)
+    def overlap(writer: Writer) -> Value:
         _, a, b = writer.arguments
 
         def touch(first: int) -> Value:
@@ -206,8 +206,8 @@ def _meets(dimension: int) -> Callable[..., bool]:
     lower and upper end along the first axis, and then along the others, are the numbers from ``limits[b]`` on.
     """
 
-    @_instructions(boolean, _ARRAY, int64, _ARRAY, int64)
-    def meets(writer: _Writer) -> Value:
+    @instructions(boolean, ANY, int64, ANY, int64)
+    def meets(writer: Writer) -> Value:
         (_, offset, _, first), builder = writer.arguments, writer.builder
         flags = ir.Constant(_FLAGS, [1] * CHUNK)
         for axis in range(dimension):
@@ -228,8 +228,8 @@ lanes_overlap_2, lanes_overlap_3 = _overlap(2, CHUNK, 2 * TILE), _overlap(3, CHU
 lanes_meet_2, lanes_meet_3 = _meets(2), _meets(3)
 
 
-@_instructions(void, _ARRAY, int64, _ARRAY, int64)
-def copy_chunk(writer: _Writer) -> None:
+@instructions(void, ANY, int64, ANY, int64)
+def copy_chunk(writer: Writer) -> None:
     """``(source, a, target, b)``: copy ``CHUNK`` numbers from ``source[a]`` on to ``target[b]`` on."""
     _, a, _, b = writer.arguments
     writer.store(writer.load(0, a), 2, b)
@@ -242,8 +242,8 @@ def _add_turned(power: int) -> Callable[..., None]:
     rows from ``sums[a]`` on; with power 2 ``cosine x^2 + sine y^2`` and ``cosine y^2 + sine x^2``.
     """
 
-    @_instructions(void, _ARRAY, int64, _ARRAY, int64, _ARRAY, int64, _ARRAY, int64)
-    def add_turned(writer: _Writer) -> None:
+    @instructions(void, ANY, int64, ANY, int64, ANY, int64, ANY, int64)
+    def add_turned(writer: Writer) -> None:
         (_, a, _, b, _, c, _, d), builder = writer.arguments, writer.builder
         x, y = writer.load(2, b), writer.load(2, b, CHUNK)
         if power == 2:
@@ -264,8 +264,8 @@ add_turned, add_turned_squares = _add_turned(1), _add_turned(2)
 def _at_most_of(count: int) -> Callable[..., np.uint64]:
     """``(w, offset, bound) -> mask``: where ``w[offset:offset + count] <= bound``."""
 
-    @_instructions(uint64, _ARRAY, int64, float32)
-    def at_most(writer: _Writer) -> Value:
+    @instructions(uint64, ANY, int64, float32)
+    def at_most(writer: Writer) -> Value:
         _, offset, bound = writer.arguments
         limit = writer.splat(bound)
         return writer.mask(count, lambda first: writer.at_most(writer.load(0, offset, first), limit))
@@ -276,8 +276,8 @@ def _at_most_of(count: int) -> Callable[..., np.uint64]:
 at_most, chunk_at_most = _at_most_of(TILE), _at_most_of(CHUNK)
 
 
-@_instructions(void, _ARRAY, int64, uint64, float32)
-def subtract_where(writer: _Writer) -> None:
+@instructions(void, ANY, int64, uint64, float32)
+def subtract_where(writer: Writer) -> None:
     """``(w, offset, mask, amount)``: take ``amount`` from ``w[offset:offset + TILE]`` where the mask is set."""
     (_, offset, mask, amount), builder = writer.arguments, writer.builder
     value, nothing = writer.splat(amount), ir.Constant(_FLOATS, [0.0] * CHUNK)
@@ -287,8 +287,8 @@ def subtract_where(writer: _Writer) -> None:
         writer.store(builder.fsub(writer.load(0, offset, first), part), 0, offset, first)
 
 
-@_instructions(void)
-def use_wide_registers(writer: _Writer) -> None:
+@instructions(void)
+def use_wide_registers(writer: Writer) -> None:
     """Let the compiler use all of the registers' width in the function that calls this.
 
     LLVM keeps to half of AVX-512's by default, because using all of it may slow the clock of some processors a little.

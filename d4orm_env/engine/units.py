@@ -12,18 +12,14 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
-from inspect import Parameter
-from inspect import Signature as Parameters
 from typing import Any, TypeAlias
 
-from llvmlite.ir import Constant, IntType, IRBuilder, Value
+from llvmlite.ir import Constant, IntType
 from numba.core import types
-from numba.core.typing.context import BaseContext as TypingContext
-from numba.core.typing.templates import Signature
 
 from d4orm_env.engine.caching import is_kept
 from d4orm_env.engine.compiling import WITHOUT_ARRAYS
-from d4orm_env.engine.simd import Instructions, intrinsic
+from d4orm_env.engine.simd import ANY, Writer, instructions
 from d4orm_env.engine.threads import available_cores
 
 CONTACTS, OBSTACLES, OBSERVATION, SEEN_OBSTACLES, ROBOTS = range(5)
@@ -59,26 +55,17 @@ def caller(count: int) -> Callable[..., None]:
     ``address`` is an array of the two numbers of :func:`address_of`.
     """
 
-    def call(typing_context: TypingContext, address: types.Type, *given: types.Type) -> Instructions:
-        def generate(context: Any, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]) -> Value:
-            convention, row = context.call_conv, context.make_array(address)(context, builder, arguments[0])
-            where, kinds = (
-                builder.load(builder.gep(row.data, [Constant(IntType(64), i)], inbounds=True)) for i in range(2)
-            )
-            with builder.if_then(builder.icmp_unsigned("!=", kinds, Constant(kinds.type, _digest(given))), False):
-                convention.return_user_exc(builder, TypeError, ("a unit is compiled for other types of arguments",))
-            kind = convention.get_function_type(types.void, given)
-            function = builder.inttoptr(where, kind.as_pointer())
-            convention.call_function(builder, function, types.void, given, arguments[1:])
-            return context.get_dummy_value()
+    @instructions(types.void, *[ANY] * (1 + count))
+    def call(writer: Writer) -> None:
+        context: Any = writer.context
+        builder, kinds, convention = writer.builder, writer.signature.args[1:], context.call_conv
+        where, digest = (builder.load(writer.address(0, Constant(IntType(64), i))) for i in range(2))
+        with builder.if_then(builder.icmp_unsigned("!=", digest, Constant(digest.type, _digest(kinds))), False):
+            convention.return_user_exc(builder, TypeError, ("a unit is compiled for other types of arguments",))
+        function = builder.inttoptr(where, convention.get_function_type(types.void, kinds).as_pointer())
+        convention.call_function(builder, function, types.void, kinds, writer.arguments[1:])
 
-        return types.void(address, *given), generate
-
-    names = ("typing_context", "address", *(f"argument_{number}" for number in range(count)))
-    call.__signature__ = Parameters(  # type: ignore[attr-defined] # numba counts them
-        [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in names]
-    )
-    return intrinsic(call)
+    return call
 
 
 def path_of(function: Any, *arguments: str) -> Path:
