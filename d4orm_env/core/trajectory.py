@@ -71,8 +71,12 @@ class DisturbanceEvents:
     @property
     def stall_starts(self) -> BoolArray:
         """``(T + 1, K)`` bool: where a robot stops obeying."""
-        before = np.concatenate([np.zeros_like(self.stalled[:1]), self.stalled[:-1]])
-        return self.stalled & ~before
+        return beginnings(self.stalled)
+
+
+def beginnings(flags: BoolArray) -> BoolArray:
+    """``(T, K)`` bool: where flags ``(T, K)`` become true."""
+    return flags & ~np.concatenate([np.zeros_like(flags[:1]), flags[:-1]])
 
 
 def arrival_steps(arrived: BoolArray) -> NDArray[np.intp]:

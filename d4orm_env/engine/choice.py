@@ -4,26 +4,15 @@ from __future__ import annotations
 
 import sys
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import is_one_of
 from d4orm_env.core.errors import unknown
-from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.types import Engine
-
-if TYPE_CHECKING:
-    from d4orm_env.engine import cpu
-    from d4orm_env.jax import jax_engine
-else:
-    cpu = LazyModule("d4orm_env.engine.cpu")
-    jax_engine = LazyModule("d4orm_env.jax.jax_engine")
-
-jax: Any = LazyModule("jax")
 
 ENGINES = ("auto", "cpu", "jax")
 
@@ -38,9 +27,14 @@ def get_engine(name: str = "auto", num_threads: int | None = None) -> Engine:
     Raises:
         ValueError: If there is no such engine.
     """
+    # Here, because importing what computes takes longer than all else.
     if resolve_engine(name) == "jax":
-        return jax_engine.JaxEngine()
-    return cpu.CpuEngine(num_threads)
+        from d4orm_env.jax.jax_engine import JaxEngine
+
+        return JaxEngine()
+    from d4orm_env.engine.cpu import CpuEngine
+
+    return CpuEngine(num_threads)
 
 
 def rollout(problem: Problem, controls: ArrayLike, engine: str = "auto") -> Trajectory:
@@ -75,4 +69,6 @@ def _accelerator_visible() -> bool:
     # which would take longer than planning.
     if "jax" not in sys.modules and not any(find_spec(plugin) for plugin in ("jax_plugins", "libtpu")):
         return False
+    import jax
+
     return jax.default_backend() != "cpu"

@@ -277,22 +277,10 @@ def _masked(values: Mapping[str, NDArray[np.generic]], mask: BoolArray) -> Info:
 
 
 def _final_infos(observations: FloatArray, infos: Info, ended: BoolArray) -> Info:
-    """Last observations and infos of episodes that have ``ended`` ``(B,)``, kept before their worlds are reset.
-
-    ``infos`` go into the result.
-    """
+    """Last observations and infos of episodes that have ``ended`` ``(B,)``, kept before their worlds are reset."""
     final_obs = np.full(len(ended), None, dtype=object)
     for world in np.flatnonzero(ended):
         final_obs[world] = observations[world].copy()
-    final_info: Info = {}
-    for key in [name for name in infos if not name.startswith("_")]:
-        final_info[key] = infos[key]
-        if isinstance(infos[key], np.ndarray):
-            final_info[key][~ended] = 0
-        final_info[f"_{key}"] = ended.copy()
-    return {
-        "final_obs": final_obs,
-        "_final_obs": ended.copy(),
-        "final_info": final_info,
-        "_final_info": ended.copy(),
-    }
+    arrays = {name: infos[name] for name in infos if not name.startswith("_") and name != "metrics"}
+    final_info = _masked(arrays, ended) | {"metrics": infos["metrics"], "_metrics": ended.copy()}
+    return {"final_obs": final_obs, "_final_obs": ended.copy(), "final_info": final_info, "_final_info": ended.copy()}

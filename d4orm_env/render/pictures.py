@@ -21,7 +21,7 @@ from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.core.summary_line import KeyFigure, count
-from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory, arrival_times
+from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory, arrival_times, beginnings
 from d4orm_env.render import own_style
 from d4orm_env.render.frames import MarkLayer
 from d4orm_env.render.panels import (
@@ -44,14 +44,9 @@ pyplot: Any = LazyModule("matplotlib.pyplot")
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 
-def _contact_starts(collided: Array) -> Array:
-    """Flags of the moments at which a contact begins, of flags ``(T, K)`` of contact."""
-    return collided & ~np.concatenate([np.zeros_like(collided[:1]), collided[:-1]])
-
-
 def contact_points(trajectory: Trajectory) -> list[Array]:
     """Return, for every time, the ``(N, d)`` positions at which a robot has come into contact up to then."""
-    starts = _contact_starts(np.asarray(trajectory.collided))
+    starts = beginnings(np.asarray(trajectory.collided))
     return [np.asarray(trajectory.positions)[: t + 1][starts[: t + 1]] for t in range(len(starts))]
 
 
@@ -128,7 +123,7 @@ def _draw_history(layer: TeamLayer, trajectory: Trajectory) -> None:
     panel, problem = layer.panel, layer.problem
     positions, collided = np.asarray(trajectory.positions), np.asarray(trajectory.collided)
     margin_only = positions[np.asarray(trajectory.margin_violated) & ~collided]
-    further = positions[collided & ~_contact_starts(collided)]
+    further = positions[collided & ~beginnings(collided)]
     size = 0.5 * layer.mark_size
     panel.polygons(panel.outlines(margin_only, size), facecolors=MARGIN, edgecolors="none", zorder=2)
     panel.polygons(panel.outlines(further, size), facecolors=CONTACT, edgecolors="none", zorder=3.5)
