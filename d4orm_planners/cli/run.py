@@ -9,13 +9,14 @@ import webbrowser
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import rich
 import typer
 from typer import Argument, Option
 
 from d4orm_env import make_problem, navigation_v0, verify
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import count
 from d4orm_env.disturbances.disturbance import AnyDisturbance
@@ -58,6 +59,7 @@ from d4orm_planners.sampling.denoising import DenoisingFilm
 if TYPE_CHECKING:
     from d4orm_planners.play.playground import Playground
 
+playgrounds: Any = LazyModule("d4orm_planners.play.playground", "d4orm play", "viz")
 LAST_WAIT = 2.0  #: Seconds from Ctrl-C of ``d4orm play`` to the end of the process
 
 
@@ -194,15 +196,11 @@ def play(options: PlayOptions) -> None:
 
 
 def _playground(options: PlayOptions) -> Playground:
-    try:
-        from d4orm_planners.play.playground import Playground
-    except ImportError as error:
-        raise ImportError("d4orm play needs viser; install it with: pip install 'd4orm-env[viz]'") from error
-
+    make = playgrounds.Playground  # which says first if a library is missing
     rich.get_console().quiet = True  # or viser prints a line for every client of another version
     typer.echo("getting ready; the first time this compiles for a while ...")
     policies = names(options.policy) or ()
-    return Playground(
+    return make(
         options.problem(), *policies, seed=options.seed, host=options.host, port=options.port, **options.observation
     )
 

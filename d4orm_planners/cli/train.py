@@ -8,15 +8,14 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Argument, Option
 
 from d4orm_env.core.errors import unknown
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.cli.options import (
@@ -43,6 +42,8 @@ from d4orm_planners.rl.dataset.write import checked_id, dataset_folder, write_da
 if TYPE_CHECKING:
     from d4orm_planners.rl.training import TrainingResult
 
+training: Any = LazyModule("d4orm_planners.rl.training", "training", "rl")
+imitation: Any = LazyModule("d4orm_planners.rl.imitation", "training", "rl")
 IMITATION = "imitation"
 
 
@@ -129,7 +130,6 @@ def train(options: TrainOptions) -> None:
 
 
 def _learning(options: TrainOptions) -> Callable[..., TrainingResult]:
-    training, imitation = _library("training"), _library("imitation")
     if options.algorithm == IMITATION:
         learn, kind, other = imitation.imitate, imitation.ImitationSettings, training.TrainingSettings
         reason = "is for ppo and sac; leave it out"
@@ -151,13 +151,6 @@ def _learning(options: TrainOptions) -> Callable[..., TrainingResult]:
             raise ValueError(f"--steps is {steps:g}; it must be a whole number of at least 1")
         given |= {"steps": int(steps), "mixture": tuple(options.mixture or ())}
     return partial(learn, kind(**given))
-
-
-def _library(name: str) -> ModuleType:
-    try:
-        return import_module(f"d4orm_planners.rl.{name}")
-    except ModuleNotFoundError as error:
-        raise ImportError(f"training needs {error.name}; install it with: pip install 'd4orm-env[rl]'") from None
 
 
 @dataclass(frozen=True, kw_only=True)
