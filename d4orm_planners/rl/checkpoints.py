@@ -189,7 +189,7 @@ class Checkpoint:
 
     def _numbers(self, model: BaseAlgorithm, env: VecNormalize, fresh: bool) -> dict[str, np.ndarray]:
         """The arrays of ``state.npz`` that are wanted, none larger than the model and the environment have room for."""
-        room = _room(model, env)
+        room = _numbers(model, env, whole=True)
         numbers = {}
         with (self.folder / "state.npz").open("rb") as stream, ArrayArchive(stream, room) as archive:
             for name, largest in room.items():
@@ -219,21 +219,14 @@ def _readable(folder: Path) -> Iterator[None]:
         ) from error
 
 
-def _room(model: BaseAlgorithm, env: VecNormalize) -> dict[str, np.ndarray]:
-    """Arrays like those of :func:`_numbers`, those of the replay buffer as when it is full."""
-    room = _numbers(model, env)
-    buffer = getattr(model, "replay_buffer", None)
-    return room if buffer is None else room | {f"replay_{name}": getattr(buffer, name) for name in _REPLAY}
-
-
-def _numbers(model: BaseAlgorithm, env: VecNormalize) -> dict[str, Any]:
-    """Return numbers that Stable-Baselines3 does not keep in its zip, or keeps pickled."""
+def _numbers(model: BaseAlgorithm, env: VecNormalize, whole: bool = False) -> dict[str, Any]:
+    """Numbers that Stable-Baselines3 does not keep in its zip, or keeps pickled; with ``whole``, of a full buffer."""
     numbers = {name: np.array(getattr(model, name)) for name in _COUNTERS}
     for name, running in _running(env).items():
         numbers |= {f"{name}_{part}": np.array(getattr(running, part)) for part in ("mean", "var", "count")}
     buffer = getattr(model, "replay_buffer", None)
     if buffer is not None:
-        count = buffer.buffer_size if buffer.full else buffer.pos
+        count = buffer.buffer_size if whole or buffer.full else buffer.pos
         numbers |= {f"replay_{name}": getattr(buffer, name)[:count] for name in _REPLAY}
         numbers |= {"replay_pos": np.array(buffer.pos), "replay_full": np.array(buffer.full)}
     return numbers

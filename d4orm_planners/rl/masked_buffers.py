@@ -6,7 +6,6 @@ from collections.abc import Generator
 from functools import cached_property
 
 import numpy as np
-import torch
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
@@ -58,17 +57,12 @@ class MaskedReplayBuffer(_MaskedBuffer, ReplayBuffer):
         rewards = self._normalize_reward(self.rewards[rows, slots].reshape(-1, 1), env)
         dones = (self.dones[rows, slots] * (1 - self.timeouts[rows, slots])).reshape(-1, 1)
         return ReplayBufferSamples(
-            self._seen(self.observations[rows, slots], env),
+            self.to_torch(self._normalize_obs(self.observations[rows, slots], env)),  # type: ignore[arg-type]
             self.to_torch(self.actions[rows, slots]),
-            self._seen(self.next_observations[rows, slots], env),
+            self.to_torch(self._normalize_obs(self.next_observations[rows, slots], env)),  # type: ignore[arg-type]
             self.to_torch(dones),
             self.to_torch(rewards),
         )
-
-    def _seen(self, observations: np.ndarray, env: VecNormalize | None) -> torch.Tensor:
-        normalized = self._normalize_obs(observations, env)
-        assert isinstance(normalized, np.ndarray)
-        return self.to_torch(normalized)
 
     def _acted_steps(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return as many steps as there are rows, drawn again until a robot acted in them."""

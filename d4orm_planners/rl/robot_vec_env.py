@@ -171,15 +171,19 @@ class RobotVecEnv(SharedVecEnv):
         observations, _, terminated, truncated, infos = self._env.step(controls.reshape(self._shape[0], -1))
         ended, acting = terminated | truncated, self._acting
         now = {name: infos[name] for name in ("arrived", "collided")}
+        self.finished = []
         if ended.any():
-            final = infos["final_info"]
+            final, metrics = infos["final_info"], infos["final_info"]["metrics"]
             now = {name: np.where(ended[:, None], final[name], value) for name, value in now.items()}
+            self.finished = [
+                (int(world), bool(metrics["success"][world]), float(metrics["travel_time"][world]))
+                for world in np.flatnonzero(ended)
+            ]
         self._rewards = self._env.robot_rewards * acting
         self.acted = acting.ravel()
         self._touched |= now["collided"] & acting
         self._return += self._rewards
         self._length += acting
-        self._finish_worlds(ended, infos)
         self._arrived = now["arrived"]
         # The slot of an arrived robot ends with its world, so that the next episode begins afresh.
         self._dones = np.where(acting, self._arrived, False) | ended[:, None]
@@ -231,15 +235,6 @@ class RobotVecEnv(SharedVecEnv):
         observed = self.features.slices.num_neighbors
         shown = np.repeat([observed if most is None else most for most in max_observed], self._shape[1])
         return np.arange(observed) >= shown[:, None]
-
-    def _finish_worlds(self, ended: BoolArray, infos: Info) -> None:
-        self.finished = []
-        if ended.any():
-            metrics = infos["final_info"]["metrics"]
-            self.finished = [
-                (int(world), bool(metrics["success"][world]), float(metrics["travel_time"][world]))
-                for world in np.flatnonzero(ended)
-            ]
 
     def _robot_infos(self, finishing: IntArray, terminal: FloatArray, arrived: BoolArray) -> list[Info]:
         """Empty but for robots whose episode has just ended, ``(N, 2)`` world and robot."""
