@@ -78,9 +78,7 @@ class JaxMARLNavigation(MultiAgentEnv):
         dones = self._by_agent(transition.finished | transition.done) | {"__all__": transition.done}
         infos = {
             "acted": transition.acted,
-            "arrived": transition.step.arrived,
-            "collided": transition.step.collided,
-            "margin_violated": transition.step.margin_violated,
+            **{name: getattr(transition.step, name) for name in ("arrived", "collided", "margin_violated")},
             "distance_to_goal": transition.step.distances,
             "success": transition.success,
         }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +14,9 @@ from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.jax.jax_footprints import PlacedBodies, place_robots
 
-
-class OtherBodies(NamedTuple):
-    """Bodies of all robots, seen from one of them."""
-
-    x: Array  #: ``(F,)`` reference points
-    y: Array  #: Likewise
-    radius: Array  #: ``(F,)`` of discs; -1 of its own bodies
-    cores: PlacedBodies | None  #: Footprints, as ``(.., F)``; ``None`` of a team of discs
+OtherBodies: TypeAlias = tuple[Array, Array, Array, PlacedBodies | None]
+"""Bodies of all robots, seen from one of them: ``(F,)`` reference points x and y, and radii of discs, -1 of its own
+bodies; and footprints, as ``(.., F)``, ``None`` of a team of discs."""
 
 
 def cast_rays(
@@ -45,7 +40,7 @@ def cast_rays(
 
     def of_robot(robot: Array, x: Array, y: Array, cosine: Array, sine: Array) -> Array:
         own = owner == robot
-        others = OtherBodies(bodies[0] - x, bodies[1] - y, jnp.where(own, -1, radius), cores)
+        others = bodies[0] - x, bodies[1] - y, jnp.where(own, -1, radius), cores
         aim = cosine * fan[:, 0] - sine * fan[:, 1], sine * fan[:, 0] + cosine * fan[:, 1]
         distances = jax.vmap(lambda ray_x, ray_y: _nearest(arrays, others, x, y, ray_x, ray_y))(*aim)
         return jnp.minimum(distances, layout.ray_range)
