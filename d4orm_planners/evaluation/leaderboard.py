@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from typing import Any
 
 from d4orm_planners.base.display import markdown_text
 from d4orm_planners.evaluation.store import Trial
@@ -38,7 +38,7 @@ def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str
     if not trials:
         raise ValueError("the store holds no trials yet; run `d4orm evaluate` first")
     groups = _groups(_told_apart(trials))
-    rates = success_rates(TrialGroup(key[0], group, key[-1]) for key, group in groups.items())
+    rates = success_rates(groups)
     blocks = [INTRODUCTION, "## Success", *_matrices(rates), "## Scenario by scenario"]
     for title, panel in panels(rates).items():
         # The best first, at every level of noise.
@@ -71,20 +71,15 @@ def _told_apart(trials: Sequence[Trial]) -> list[Trial]:
     ]
 
 
-Key: TypeAlias = tuple[str, str, int, str, str, float, str]
-
-
-def _groups(trials: Sequence[Trial]) -> dict[Key, list[Trial]]:
-    """Trials by label, scenario, team, physics, noise and disturbances, in the order of all but the label."""
+def _groups(trials: Sequence[Trial]) -> list[TrialGroup]:
+    """Trials by scenario, team, physics, noise, disturbances and label, in this order."""
     labels = _labels(trials)
-    groups: dict[Key, list[Trial]] = {}
+    groups: dict[tuple[Any, ...], list[Trial]] = {}
     for trial in trials:
+        where = trial.scenario, trial.num_robots, trial.model, trial.physics, trial.control_noise_std
         label = labels[trial.label, trial.model, trial.config]
-        where = (trial.scenario, trial.num_robots, trial.model, trial.physics)
-        groups.setdefault(
-            (label, *where, trial.control_noise_std, describe_disturbances(trial.disturbances)), []
-        ).append(trial)
-    return {key: groups[key] for key in sorted(groups, key=lambda key: (*key[1:], key[0]))}
+        groups.setdefault((*where, describe_disturbances(trial.disturbances), label), []).append(trial)
+    return [TrialGroup(key[-1], groups[key], key[-2]) for key in sorted(groups)]
 
 
 def describe_disturbances(disturbances: str) -> str:
@@ -136,11 +131,12 @@ def _matrices(rates: Sequence[SuccessRate]) -> list[str]:
     return blocks
 
 
-def _deadlines(groups: Mapping[Key, Sequence[Trial]], deadlines: Sequence[float]) -> list[str]:
+def _deadlines(groups: Sequence[TrialGroup], deadlines: Sequence[float]) -> list[str]:
     blocks: dict[str, list[tuple[str, Sequence[Trial]]]] = {}
-    for (label, scenario, robots, model, physics, noise, disturbance), group in groups.items():
-        where = f"{scenario}, {robots} robots, {model}{in_physics(physics)}"
-        title = f"{where}, noise {noise:g}{disturbance and ', '}{disturbance}"
+    for label, group, disturbance, _ in groups:
+        one = group[0]
+        where = f"{one.scenario}, {one.num_robots} robots, {one.model}{in_physics(one.physics)}"
+        title = f"{where}, noise {one.control_noise_std:g}{disturbance and ', '}{disturbance}"
         blocks.setdefault(title, []).append((label, group))
     return [
         deadline_table(title, [(label, [success_by(group, limit) for limit in deadlines]) for label, group in lines])

@@ -203,6 +203,7 @@ def record_episode(env: ParallelEnv, policy: Policy, seed: int = 0) -> RecordedE
         name: np.stack([getattr(step, name) for step in steps]) for name in ("arrived", "collided", "margin_violated")
     }
     acting, actions = recorder.team_actions()
+    metrics = {name: (bool if name == "success" else float)(value) for name, value in episode.metrics.items()}
     arrived = flags["arrived"][1:]
     finished = arrived if world.problem.docks else arrived & arrived.all(axis=1, keepdims=True)
     return RecordedEpisode(
@@ -214,13 +215,8 @@ def record_episode(env: ParallelEnv, policy: Policy, seed: int = 0) -> RecordedE
         **flags,
         distance_to_goal=np.stack([step.distances for step in steps]),
         state=np.stack([*recorder.states, world.state()]),
-        metadata={"seed": seed, "problem": episode.problem.digest, **_plain(episode.metrics)},
+        metadata={"seed": seed, "problem": episode.problem.digest, **metrics},
     )
-
-
-def _plain(metrics: Mapping[str, float]) -> dict[str, float | bool]:
-    numbers = {name: float(value) for name, value in metrics.items()}
-    return numbers | ({"success": bool(metrics["success"])} if "success" in metrics else {})
 
 
 def _kept(action: Any) -> Any:
