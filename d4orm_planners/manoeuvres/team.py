@@ -109,11 +109,6 @@ class TeamMotions:
         return sum(motion is None for motion in self.motions)
 
     @property
-    def solution(self) -> list[Motion | None]:
-        """See :class:`~d4orm_planners.mapf.lns.LowLevelPlanner`."""
-        return self.motions.copy()
-
-    @property
     def cost(self) -> tuple[int, int]:
         """Number of robots without a motion, or, once all have one, the sum of their steps."""
         steps = [motion.steps for motion in self.motions if motion is not None]

@@ -8,7 +8,7 @@ here by beam search under the robots' dynamics.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -27,7 +27,6 @@ from d4orm_planners.mapf.motion_primitives import MotionPrimitives
 from d4orm_planners.mapf.roundabout import drive_roundabout
 from d4orm_planners.tracking.steering import straight_drives
 
-S_co = TypeVar("S_co", covariant=True)
 ROUNDS = 96  #: Rounds of the search in an iteration: one annealing
 FIRST_ROUNDS = 4  #: Rounds for a plan that has just been found
 GUIDED_ROUNDS = 8  #: The same for one that was found on a roadmap, with all its corners and stops
@@ -66,44 +65,36 @@ class Odds(NamedTuple):
         return random.permutation(np.argsort(gaps, kind="stable")[: random.integers(*self.sizes, endpoint=True)])
 
 
-class LowLevelPlanner(Protocol[S_co]):
-    """A solution, and the search for other paths in it.
+class LowLevelPlanner(Protocol):
+    """The search for other paths in a solution, of which it has the best so far.
 
-    The ``solution``, which later rounds do not change, has a ``cost`` to compare. To ``replan`` finds other paths for
-    groups, and accepts what is better, or at this temperature a little worse; ``odds`` are the robots' chances.
+    To ``replan`` finds them for groups, and accepts what is better, or at this temperature a little worse; ``odds`` are
+    the robots' chances.
     """
 
     groups: int  #: Neighbourhoods that are replanned in a round
 
-    @property
-    def solution(self) -> S_co: ...
-    @property
-    def cost(self) -> Any: ...
     def odds(self, random: np.random.Generator) -> Odds: ...
     def replan(self, groups: list[IntArray], random: np.random.Generator, temperature: float) -> None: ...
 
 
 def search_neighbourhoods(
-    planner: LowLevelPlanner[S_co],
+    planner: LowLevelPlanner,
     random: np.random.Generator,
     rounds: int,
     should_stop: Callable[[], bool],
     temperature: float = 0.0,
-) -> S_co:
-    """Replan neighbourhoods, so many rounds, as long as there is time; return the best solution that there has been.
+) -> None:
+    """Replan neighbourhoods, so many rounds, as long as there is time.
 
     What is worse is accepted as in simulated annealing, at a temperature that falls to zero with the rounds.
     """
-    best, least = planner.solution, planner.cost
     for number in range(rounds):
         if should_stop():
             break
         odds = planner.odds(random)
         groups = [odds.draw(random) for _ in range(planner.groups)]
         planner.replan(groups, random, temperature * (1 - number / rounds))
-        if planner.cost < least:
-            best, least = planner.solution, planner.cost
-    return best
 
 
 def improve_by_lns(search: SolveRun) -> Iteration:
@@ -142,8 +133,9 @@ def improve_paths(team: WorkingPlan, seed: int, rounds: int, temperature: float 
     fails. The ``temperature``, see :data:`TEMPERATURE`, falls to zero with the rounds; at zero the best is what the
     team does.
     """
-    random, should_stop = np.random.default_rng(seed), team.search.should_stop
-    return search_neighbourhoods(_Motions(team), random, rounds, should_stop, temperature)
+    motions = _Motions(team)
+    search_neighbourhoods(motions, np.random.default_rng(seed), rounds, team.search.should_stop, temperature)
+    return motions.best
 
 
 class _Motions:
@@ -159,11 +151,7 @@ class _Motions:
         everybody, straight = np.arange(self.num_robots), straight_drives(self.problem)
         self.soonest, _ = self.costs(everybody, straight.positions[:, :, 0])
         self.arrival, self.lag = self.costs(everybody, team.states[..., : self.problem.dimension])
-
-    @property
-    def solution(self) -> FloatArray:
-        """See :attr:`LowLevelPlanner.solution`: ``(H, K, m)`` controls."""
-        return self.team.controls.copy()
+        self.best, self.least = team.controls.copy(), self.cost  #: ``(H, K, m)`` controls that cost least, and what
 
     @property
     def cost(self) -> float:
@@ -213,6 +201,8 @@ class _Motions:
             found[found] = paths.arrived[:, 0]
         for number in np.flatnonzero(found):
             self.accept(groups[number], controls[:, number], states[:, number], slack[number])
+        if self.cost < self.least:
+            self.best, self.least = self.team.controls.copy(), self.cost
 
     def accept(self, robots: IntArray, controls: FloatArray, states: FloatArray, slack: float) -> None:
         """Let robots ``(R,)`` do as they found, if it fits what the others do and costs no more than so much [s]."""

@@ -98,7 +98,8 @@ class RoadmapSolution:
         """Replan some groups of robots; what is no better for all together is left."""
         paths = RoadmapPaths(self.replanning, self.driven, config.neighbours, search.should_stop)
         random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
-        return replace(self, driven=search_neighbourhoods(paths, random, config.replannings, search.should_stop))
+        search_neighbourhoods(paths, random, config.replannings, search.should_stop)
+        return replace(self, driven=paths.solution)
 
 
 @dataclass(frozen=True)
