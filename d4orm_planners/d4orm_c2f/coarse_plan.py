@@ -75,6 +75,25 @@ def nearest_indices(path: FloatArray, positions: FloatArray, last: IntArray, win
     return index[:, 0] + ((ahead - positions[:, None]) ** 2).sum(axis=2).argmin(axis=1)
 
 
+def after_waiting(path: FloatArray, indices: IntArray, last: IntArray, steps: int) -> IntArray:
+    """``(K,)`` indices, later by up to so many ``steps`` where a path waits and its robot is where it was ``last``.
+
+    All waypoints of a wait are as near: a robot that kept to the first would wait for ever, and so would those whose
+    subgoals stay behind for it.
+    """
+    robots, here, passed = np.arange(len(indices)), path[indices, np.arange(len(indices))], indices
+    waits = (indices == last) & ~_coincide(here, path[-1])
+    for _ in range(steps):
+        after = np.minimum(passed + 1, len(path) - 1)
+        passed = np.where(waits & _coincide(here, path[after, robots]), after, passed)
+    return passed
+
+
+def _coincide(positions: FloatArray, others: FloatArray) -> BoolArray:
+    """``(K,)`` bool: positions ``(K, d)`` that are the same but for rounding."""
+    return (np.abs(positions - others) <= 1e-6 * np.abs(others)).all(axis=1)
+
+
 def subgoal_indices(indices: IntArray, mean: int, offset: int, lag: int, last: int) -> IntArray:
     """``(K,)`` the waypoint, at most the ``last``, that every robot heads for (paper, Algorithm 4, line 7).
 

@@ -21,6 +21,7 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     CoarsePlanning,
     CoarseWaypoints,
     StagnationMonitor,
+    after_waiting,
     coarse_problem,
     interpolate,
     keep_time,
@@ -93,7 +94,8 @@ class CoarsePlanTracker:
         """``(K,)`` waypoints that the robots head for; finds out where on the path they are (Algorithm 4, line 6)."""
         path, offset = self.guidance.path, self._config.subgoal_offset
         positions = joint.states[:, : self.problem.dimension]
-        self._indices = nearest_indices(path, positions, self._indices, offset)
+        nearest = nearest_indices(path, positions, self._indices, offset)
+        self._indices = after_waiting(path, nearest, self._indices, self._config.execute_horizon)
         counted = np.ones_like(arrived) if self._config.mean_of_all else ~arrived & ~self.stuck
         if counted.any():
             self.index = round(float(self._indices[counted].mean()))

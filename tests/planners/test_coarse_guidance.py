@@ -26,6 +26,7 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     CoarsePlan,
     CoarseWaypoints,
     StagnationMonitor,
+    after_waiting,
     coarse_problem,
     interpolate,
     keep_time,
@@ -130,6 +131,17 @@ def test_nearest_waypoints_are_looked_for_ahead_only() -> None:
     np.testing.assert_array_equal(nearest_indices(path, positions, [0, 3, 0], 6), [1, 5, 2])
     # A window of one waypoint reaches no further; beyond the end there is nothing.
     np.testing.assert_array_equal(nearest_indices(path, positions, [0, 3, 6], 1), [1, 4, 6])
+
+
+def test_time_passes_where_a_path_waits() -> None:
+    # The first waits for three steps, the second not, the third stays for good.
+    lines = np.array([[0.1, 0.1, 0.1, 0.1, 1, 2], [0, 1, 2, 3, 4, 5], [0, 1, 1, 1, 1, 1]])
+    path = np.stack([lines.T, np.full((6, 3), 0.3)], axis=2).astype(np.float32)
+    path[2, 0] += np.float32(2.0**-27)  # what interpolating may round
+    np.testing.assert_array_equal(after_waiting(path, np.array([0, 1, 1]), np.array([0, 1, 1]), 1), [1, 1, 1])
+    np.testing.assert_array_equal(after_waiting(path, np.array([1, 2, 2]), np.array([1, 1, 1]), 5), [3, 2, 2])
+    # It has just come there.
+    np.testing.assert_array_equal(after_waiting(path, np.array([2, 2, 2]), np.array([1, 1, 1]), 1), [2, 2, 2])
 
 
 def test_a_robot_held_up_keeps_to_its_own_path() -> None:

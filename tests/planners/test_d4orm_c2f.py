@@ -789,3 +789,10 @@ def test_robots_with_ever_new_goals_never_touch() -> None:
 def test_settings_that_make_no_sense_are_named(config: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_policy("d4orm-c2f", **config)
+
+
+@pytest.mark.parametrize("model", ["unicycle", "differential_drive"])
+def test_teams_turn_to_their_goal_headings_in_time(model: str) -> None:
+    # They are planned one after another: the coarse paths of those planned last wait.
+    env = navigation_v0.parallel_env("circle", num_robots=3, model=model, goal_heading=2.5)
+    assert run_episode(env, "d4orm-c2f", seed=0).metrics["success"]
