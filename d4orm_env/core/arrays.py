@@ -75,6 +75,8 @@ def _detached(value: Any) -> Any:
 def numbers_of(value: ArrayLike, what: str, dtype: type = np.float32) -> Any:
     """A new array of what a user gave, as :func:`as_float32`; errors say ``what`` it is: ``"goal must be numbers"``."""
     try:
+        if value is None:
+            raise ValueError("nothing was given")
         return _as_floats(value, dtype)
     except ValueError as error:
         raise ValueError(f"{what}, not {short_repr(value)}; {error}") from error
@@ -100,7 +102,7 @@ def frozen_array(
     if array.size == 0 and (0 in shape or None in shape):
         array = array.reshape([size or 0 for size in shape])
     if array.ndim != len(shape) or any(want is not None and want != have for want, have in zip(shape, array.shape)):
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        wanted = ", ".join("any" if size is None else str(size) for size in shape) + "," * (len(shape) == 1)
         meaning = ": " * bool(columns) + ", ".join(columns)
         raise ValueError(f"{name} has shape {array.shape}; expected ({wanted}){meaning}")
     too_large = np.abs(array) > largest, f"magnitudes must be at most {largest:g}"

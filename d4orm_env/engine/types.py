@@ -133,11 +133,15 @@ class WorldBatch(NamedTuple):
 
 def checked_controls(problem: Problem, controls: ArrayLike, *, batch: bool = False) -> FloatArray:
     """``(H, K, m)`` controls as a contiguous float32 array, or with ``batch`` ``(M, H, K, m)``, with finite squares."""
+    if hasattr(controls, "controls"):
+        raise ValueError(f"controls must be an array of numbers, not {type(controls).__name__}; give its controls")
     array: FloatArray = numbers_of(controls, "controls must be an array of numbers")
     expected = (problem.horizon, problem.num_robots, problem.control_size)
     if array.ndim != 3 + batch or array.shape[batch:] != expected:
         asked = f"(M, H, K, m) = (M, {', '.join(map(str, expected))})" if batch else f"(H, K, m) = {expected}"
-        raise ValueError(f"controls have shape {array.shape}; expected {asked}")
+        remedy = f"; for so many steps, give problem.replace(horizon={len(array)})"
+        remedy *= not batch and array.shape[1:] == expected[1:] and len(array) > 0
+        raise ValueError(f"controls have shape {array.shape}; expected {asked}{remedy}")
     if not np.isfinite(array).all():
         where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
         raise ValueError(f"controls{where} is not finite; every control must be")

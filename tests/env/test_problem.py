@@ -94,7 +94,7 @@ def test_bad_teams_are_refused(arguments: dict[str, Any], message: str) -> None:
         ({"lower": [0, 0]}, "bounds need both lower and upper; give both, or neither for an open world"),
         ({"upper": [0, 0]}, "bounds need both lower and upper"),
         ({"lower": [0, 0], "upper": [1, 0]}, r"bounds lower \[0.0, 0.0\] must lie below upper \[1.0, 0.0\]"),
-        ({"lower": [0, 0, 0], "upper": [1, 1, 1]}, r"bounds lower has shape \(3,\); expected \(2\)"),
+        ({"lower": [0, 0, 0], "upper": [1, 1, 1]}, r"bounds lower has shape \(3,\); expected \(2,\)"),
         ({"lower": [0, 0], "upper": [1, INF]}, r"bounds upper\[1\] is inf; every value must be finite"),
     ],
 )
