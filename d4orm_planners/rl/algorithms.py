@@ -5,9 +5,10 @@ Their policies become networks of this package.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import stable_baselines3
@@ -47,6 +48,11 @@ class _Set(nn.Module):
         return torch.cat([hidden.amax(dim=1), SUM_SCALE * hidden.sum(dim=1)], dim=1)
 
 
+_FILED = {"first.weight": "weight_0", "own.weight": "own", "first.bias": "bias_0", "second.weight": "weight_1",
+          "second.bias": "bias_1"}  # fmt: skip
+"""Names of a set's parameters in policy files."""
+
+
 class SetExtractor(BaseFeaturesExtractor):
     """Pooled features of neighbours and obstacles, beside a robot's own."""
 
@@ -65,33 +71,27 @@ class SetExtractor(BaseFeaturesExtractor):
 
     def arrays(self) -> dict[str, torch.Tensor]:
         """Parameters by the names that policy files have for them."""
-        named: dict[str, torch.Tensor] = {}
-        for kind, part in zip(KINDS, self._sets, strict=True):
-            named |= {
-                f"{kind}_weight_0": part.first.weight,
-                f"{kind}_own": part.own.weight,
-                f"{kind}_bias_0": part.first.bias,
-                f"{kind}_weight_1": part.second.weight,
-                f"{kind}_bias_1": part.second.bias,
-            }
-        return named
+        parts = zip(KINDS, self._sets, strict=True)
+        return {f"{kind}_{_FILED[name]}": own for kind, part in parts for name, own in part.named_parameters()}
 
 
 SHARES = ("tau", "gae_lambda")  #: Settings that are at most 1
 
 
+@dataclass(frozen=True, kw_only=True)
 class Algorithm:
     """One of Stable-Baselines3's algorithms."""
 
-    model: ClassVar[Any]  #: Its class
-    buffer: ClassVar[str]  #: Attribute in which a model keeps what it learns from
-    buffer_class: ClassVar[type[BaseBuffer]]  #: Class of that
-    num_envs: ClassVar[int]  #: Robots that act at once, unless configured otherwise
-    steps_per_update: ClassVar[int]  #: Steps that each of them takes between two updates
-    learning_rate: ClassVar[float] = 3e-4  #: At the beginning; it falls linearly to a tenth
-    gamma: ClassVar[float] = 0.99  #: Discount per step
-    network: ClassVar[Mapping[str, object]] = MappingProxyType({})  #: Further keywords of its networks
-    tunable: ClassVar[Mapping[str, float]]  #: More keywords of SB3 that a training may set, with values here
+    model: Any  #: Its class
+    buffer: str  #: Attribute in which a model keeps what it learns from
+    buffer_class: type[BaseBuffer]  #: Class of that
+    num_envs: int  #: Robots that act at once, unless configured otherwise
+    steps_per_update: int  #: Steps that each of them takes between two updates
+    settings: Callable[[int, int], dict[str, Any]]  #: Further keywords of SB3 for so many steps and robots
+    learning_rate: float = 3e-4  #: At the beginning; it falls linearly to a tenth
+    gamma: float = 0.99  #: Discount per step
+    network: Mapping[str, object] = field(default_factory=dict)  #: Further keywords of its networks
+    tunable: Mapping[str, float]  #: More keywords of SB3 that a training may set, with values here
 
     def make(self, env: VecNormalize, sets: Features | None, tuned: Mapping[str, float]) -> BaseAlgorithm:
         """A new model, whose first weights are drawn from the global random state."""
@@ -100,12 +100,8 @@ class Algorithm:
             network |= {"features_extractor_class": SetExtractor, "features_extractor_kwargs": {"features": sets}}
             network |= {"activation_fn": torch.nn.ReLU}
         settings: dict[str, Any] = {"learning_rate": self.learning_rate, "gamma": self.gamma, **self.tunable, **tuned}
-        settings |= {f"{self.buffer}_class": self.buffer_class, **self._settings(env)}
+        settings |= {f"{self.buffer}_class": self.buffer_class, **self.settings(self.steps_per_update, env.num_envs)}
         return self.model("MlpPolicy", env, policy_kwargs=network, device="cpu", **settings)
-
-    def _settings(self, env: VecNormalize) -> dict[str, Any]:
-        """Further keywords of Stable-Baselines3 for an environment."""
-        raise NotImplementedError
 
     def checked(self, tuned: Mapping[str, float]) -> dict[str, float]:
         """``learner_settings``, values for :attr:`tunable`, whole where those here are; ValueError for others."""
@@ -138,36 +134,31 @@ def _batch_size(steps: int, num_envs: int) -> int:
     return steps * num_envs // parts
 
 
-class _PPO(Algorithm):
-    model = stable_baselines3.PPO
-    buffer, buffer_class = "rollout_buffer", MaskedRolloutBuffer
-    num_envs = 1024
-    steps_per_update = 32
-    network = MappingProxyType({"log_std_init": -0.5})
-    tunable = MappingProxyType(
-        {"n_epochs": 4, "gae_lambda": 0.95, "clip_range": 0.2, "ent_coef": 0.0, "vf_coef": 0.5, "max_grad_norm": 0.5}
-    )
-
-    def _settings(self, env: VecNormalize) -> dict[str, Any]:
-        steps = self.steps_per_update
-        return {"n_steps": steps, "batch_size": _batch_size(steps, env.num_envs)}
-
-
-class _SAC(Algorithm):
-    model = stable_baselines3.SAC
-    buffer, buffer_class = "replay_buffer", MaskedReplayBuffer
-    num_envs = 64
-    steps_per_update = 1
-    learning_rate = 1e-3
-    tunable = MappingProxyType({"batch_size": 256, "gradient_steps": 4, "tau": 0.02, "buffer_size": 300_000})
-
-    def _settings(self, env: VecNormalize) -> dict[str, Any]:
+ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType({
+    "ppo": Algorithm(
+        model=stable_baselines3.PPO,
+        buffer="rollout_buffer",
+        buffer_class=MaskedRolloutBuffer,
+        num_envs=1024,
+        steps_per_update=32,
+        settings=lambda steps, robots: {"n_steps": steps, "batch_size": _batch_size(steps, robots)},
+        network={"log_std_init": -0.5},
+        tunable={"n_epochs": 4, "gae_lambda": 0.95, "clip_range": 0.2, "ent_coef": 0.0, "vf_coef": 0.5,
+                 "max_grad_norm": 0.5},
+    ),
+    "sac": Algorithm(
+        model=stable_baselines3.SAC,
+        buffer="replay_buffer",
+        buffer_class=MaskedReplayBuffer,
+        num_envs=64,
+        steps_per_update=1,
+        learning_rate=1e-3,
         # Little entropy from the beginning: what is paid for at first stays in the values for long.
-        entropy = "auto_0.05"
-        return {"ent_coef": entropy, "learning_starts": 50 * env.num_envs, "train_freq": self.steps_per_update}
-
-
-ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType({"ppo": _PPO(), "sac": _SAC()})  #: By their policies' names
+        settings=lambda steps, robots: {"ent_coef": "auto_0.05", "learning_starts": 50 * robots, "train_freq": steps},
+        tunable={"batch_size": 256, "gradient_steps": 4, "tau": 0.02, "buffer_size": 300_000},
+    ),
+})  # fmt: skip
+"""By their policies' names."""
 
 
 def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: VecNormalize) -> Network:
