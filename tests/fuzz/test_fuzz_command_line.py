@@ -65,7 +65,7 @@ FOLDER = ("demo", "evaluate", "robustness", "bench", "train", "dataset")
 
 def options_of(command: str) -> list[Any]:
     """The options that a command has, however many there are one day."""
-    parameters = typer.main.get_command(cli.app).commands[command].params  # type: ignore[attr-defined]
+    parameters = typer.main.get_command(cli.app).get_command(None, command).params  # type: ignore[attr-defined]
     options = [parameter for parameter in parameters if parameter.opts[0].startswith("--")]
     return [option for option in options if option.name != "out" or command not in FOLDER]
 
