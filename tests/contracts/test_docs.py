@@ -16,7 +16,7 @@ import pytest
 
 from d4orm_env.core.robot_types import ROBOTS
 from d4orm_planners import list_policies
-from d4orm_planners.cli.app import LazyCommands
+from d4orm_planners.cli.app import Commands
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -94,12 +94,12 @@ def test_programs_run(page: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("page", [page for page, text in PAGES.items() if commands(text)])
 def test_commands_are_understood(page: str) -> None:
-    known = LazyCommands()
+    known = Commands()
     for line in commands(PAGES[page]):
         words = shlex.split(line, comments=True)
         if words[:1] == ["d4orm"] and not words[1].startswith("-"):
             try:
-                known[words[1]].make_context(words[1], words[2:])
+                known.get_command(None, words[1]).make_context(words[1], words[2:])
             except ImportError as error:
                 if not EXTRA.search(str(error)):
                     raise
