@@ -56,7 +56,8 @@ CLEARANCE, HEIGHT, FRONT_GAP = 0.25, 0.85, 0.02
 """Measures of a robot, over the radius of the largest disc about its reference point within it. The caster is behind;
 one in front, off the floor, keeps the nose up."""
 WHEEL_SHARE, BATTERY_SHARE, BATTERY_POSITION = 0.1, 0.5, (-0.15, 0.0, 0.2)
-"""Shares of the mass: of each wheel, and of what lies low and behind the axle."""
+SHELL_SHARE = 1 - 2 * WHEEL_SHARE - BATTERY_SHARE
+"""Shares of a drive's mass: of each wheel, of what lies low and behind the axle, and of its shell."""
 ROLLING, SOLID = 1, 2
 """Kinds of contact: of what rolls on the floor, and of what bodies must not touch."""
 _PALETTE = ((0.12, 0.47, 0.71), (1.0, 0.5, 0.05), (0.17, 0.63, 0.17), (0.84, 0.15, 0.16), (0.58, 0.4, 0.74),
@@ -130,11 +131,17 @@ def build_scene(problem: Problem, physics: Physics, body_radius: FloatArray, ste
         body = spec.worldbody.add_body(name=f"intruder_{number}", mocap=True)
         add_cylinder(body, size, 0.0, top, physics, rgba=[0.2, 0.2, 0.2, 1])
     for robot, name in enumerate(problem.team.models):
-        add = add_puck if name in PUCKS else add_drive
-        body = add(spec, robot, float(radius[robot]), top, physics, is_solid=not problem.team.shapes)
+        body, size, shapes = spec.worldbody.add_body(name=f"robot_{robot}"), float(radius[robot]), problem.team.shapes
+        mass, share = physics.surface_density * size * size, 1.0 if name in PUCKS else SHELL_SHARE
+        contact, low = NOWHERE if shapes else {}, CLEARANCE * size
+        add_cylinder(body, size, low, top, physics, mass=share * mass, rgba=colour(robot), **contact)
+        if name in PUCKS:
+            add_puck(body, size, mass, physics, turns=not shapes)
+        else:
+            add_drive(body, size, mass, physics)
         footprint = problem.team.footprint[robot]
-        if problem.team.shapes and isinstance(footprint, Disc | Planar):
-            add_bumper(spec, body, footprint.core, CLEARANCE * float(radius[robot]), top, physics)
+        if shapes and isinstance(footprint, Disc | Planar):
+            add_bumper(spec, body, footprint.core, low, top, physics)
     try:
         model = spec.compile()
     except ValueError as error:
@@ -242,31 +249,18 @@ def add_bumper(
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=middle, **attributes)
 
 
-def add_puck(
-    spec: mujoco.MjSpec, robot: int, radius: float, top: float, physics: Physics, *, is_solid: bool
-) -> mujoco.MjsBody:
-    """A disc that glides over the floor against a drag, and turns when it is touched; not if it has a bumper."""
-    body = spec.worldbody.add_body(name=f"robot_{robot}")
-    mass = physics.surface_density * radius * radius
+def add_puck(body: mujoco.MjsBody, radius: float, mass: float, physics: Physics, *, turns: bool) -> None:
+    """Have a robot glide over the floor against a drag, and turn when it is touched; not if it has a bumper."""
     slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
     body.add_joint(type=slide, axis=[1, 0, 0], damping=physics.drag * mass)
     body.add_joint(type=slide, axis=[0, 1, 0], damping=physics.drag * mass)
-    turning = physics.drag / 2 if is_solid else HEADING_DAMPING
+    turning = physics.drag / 2 if turns else HEADING_DAMPING
     body.add_joint(type=hinge, axis=[0, 0, 1], damping=turning * mass * radius * radius)
-    contact: dict[str, Any] = {} if is_solid else NOWHERE
-    add_cylinder(body, radius, CLEARANCE * radius, top, physics, mass=mass, rgba=colour(robot), **contact)
-    return body
 
 
-def add_drive(
-    spec: mujoco.MjSpec, robot: int, radius: float, top: float, physics: Physics, *, is_solid: bool
-) -> mujoco.MjsBody:
-    """A round robot on two wheels and a caster; its frame is on the floor, under the middle of the axle."""
-    body = spec.worldbody.add_body(name=f"robot_{robot}")
+def add_drive(body: mujoco.MjsBody, radius: float, mass: float, physics: Physics) -> None:
+    """Put a robot on two wheels and a caster; its frame is on the floor, under the middle of the axle."""
     body.add_freejoint()
-    mass, shell = physics.surface_density * radius * radius, 1 - 2 * WHEEL_SHARE - BATTERY_SHARE
-    contact: dict[str, Any] = {} if is_solid else NOWHERE
-    add_cylinder(body, radius, CLEARANCE * radius, top, physics, mass=shell * mass, rgba=colour(robot), **contact)
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=[0.3 * radius, 0.3 * radius, 0.05 * radius],
@@ -290,4 +284,3 @@ def add_drive(
             size=[WHEEL_RADIUS * radius, WHEEL_HALF_WIDTH * radius, WHEEL_RADIUS * radius],
             friction=[physics.wheel_friction, 0.005, 0.0001], priority=1, rgba=[0.1, 0.1, 0.1, 1],
         )  # fmt: skip
-    return body
