@@ -18,12 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import short_repr
-from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Stretch, VerificationReport, Violation
+from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Stretch
 from d4orm_env.verify.curves import CHORD_ERROR
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
 from d4orm_env.verify.footprints import make_watches
 from d4orm_env.verify.geometry import ConvexBodies, Floats, norm
 from d4orm_env.verify.motion import MODELS, TeamMotion
+from d4orm_env.verify.report import VerificationReport, Violation
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem

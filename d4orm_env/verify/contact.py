@@ -1,4 +1,4 @@
-"""What :func:`~d4orm_env.verify.verify` finds: closest approaches of bodies over continuous time, and their times.
+"""Closest approach of bodies over continuous time, and its time.
 
 The motion is cut into sub-steps so short that each curve departs from its chord by at most ``CHORD_ERROR`` of the
 radius, and on the chords the closest approach is solved exactly.
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from d4orm_env.verify.geometry import Floats, Indices, closest_approach, norm
+from d4orm_env.verify.report import Violation
 
 _ROUNDING = 2.0**-30
 """Rounding of distances, as a share of how far any robot gets."""
@@ -27,53 +28,6 @@ FEW = 128
 
 MAX_NUMBERS = 2**18
 """Numbers in the largest arrays that are worked on at once, but for those of a single step."""
-
-
-@dataclass(frozen=True)
-class Violation:
-    """One thing wrong with a plan."""
-
-    #: ``"robot contact"``, ``"obstacle contact"``, ``"bounds contact"``, ``"control limit"``, ``"not arrived"``,
-    #: ``"non-finite"``, ``"not judged"`` or, of curves, ``"hitch limit"``
-    kind: str
-    robots: tuple[int, ...]  #: Indices of the robots concerned
-    time: float  #: Time at which it first happens, contacts to within a sub-step [s]
-    detail: str  #: Description, with values and units
-
-    def __str__(self) -> str:
-        names = " and ".join(f"robot_{robot}" for robot in self.robots)
-        return f"{self.kind} at {self.time:.3f} s, {names}: {self.detail}"
-
-
-@dataclass(frozen=True, eq=False)
-class VerificationReport:
-    """Findings of :func:`~d4orm_env.verify.verify`."""
-
-    #: Smallest gap between the surfaces of two robots over continuous time, negative where they overlap [m]; infinite
-    #: for one robot, NaN for a plan whose motion is not judged. Of ellipsoids it is the gap along the line of their
-    #: centres.
-    min_separation: float
-    #: Smallest gap from a robot's surface to an obstacle or the bounds, negative inside [m]; infinite in an empty open
-    #: world, NaN for a plan whose motion is not judged
-    min_clearance: float
-    #: ``(K,)`` when each robot docked, in the first reading of its docking [s]; infinite for one that does not dock in
-    #: every reading
-    arrival_times: Floats
-    #: ``(K,)`` speed at which each robot then docked [m/s]; NaN where it does not dock, or is not stopped
-    arrival_speeds: Floats
-    #: Whether each robot that docked can brake away that speed in the step after: if so the plan obeys the model to its
-    #: end. It does not where goals stop robots dead (an infinite goal speed, as in the paper). Trajectories leave that
-    #: step out: velocities are zero as robots dock, in which they change by up to twice what robots brake away in a
-    #: step, and real ones roll on by up to ``max_acceleration * dt**2 / 2``.
-    dynamics_ok: bool
-    #: Everything wrong, by time; one entry for each pair, robot and obstacle, robot and side of the bounds, or robot
-    #: and limit
-    violations: list[Violation]
-
-    @property
-    def ok(self) -> bool:
-        """True if nothing is wrong."""
-        return not self.violations
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from d4orm_env.core import portable
-from d4orm_env.verify.contact import MAX_NUMBERS, Stretch, VerificationReport, Violation
+from d4orm_env.verify.contact import MAX_NUMBERS, Stretch
 from d4orm_env.verify.docking import HEADING_DOUBT, heading_errors, heading_note
 from d4orm_env.verify.footprints import make_watches
 from d4orm_env.verify.geometry import ConvexBodies, Floats, Indices, norm
+from d4orm_env.verify.report import VerificationReport, Violation
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem

@@ -1,4 +1,4 @@
-"""What stands still in a world, obstacles kind by kind and bounds, and discs and balls against it."""
+"""Everything that stands still in a world, obstacles kind by kind and bounds, and discs and balls against it."""
 
 from __future__ import annotations
 

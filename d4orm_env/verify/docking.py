@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.verify.contact import Violation
 from d4orm_env.verify.geometry import Floats, norm
 from d4orm_env.verify.motion import TeamMotion
+from d4orm_env.verify.report import Violation
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
