@@ -139,8 +139,8 @@ def checked_controls(problem: Problem, controls: ArrayLike, *, batch: bool = Fal
     expected = (problem.horizon, problem.num_robots, problem.control_size)
     if array.ndim != 3 + batch or array.shape[batch:] != expected:
         asked = f"(M, H, K, m) = (M, {', '.join(map(str, expected))})" if batch else f"(H, K, m) = {expected}"
-        remedy = f"; for so many steps, give problem.replace(horizon={len(array)})"
-        remedy *= not batch and array.shape[1:] == expected[1:] and len(array) > 0
+        fits = not batch and array.size > 0 and array.shape[1:] == expected[1:]
+        remedy = f"; for so many steps, give problem.replace(horizon={len(array)})" if fits else ""
         raise ValueError(f"controls have shape {array.shape}; expected {asked}{remedy}")
     if not np.isfinite(array).all():
         where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import short_repr
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Stretch
 from d4orm_env.verify.curves import CHORD_ERROR
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
@@ -68,7 +67,8 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
         ValueError: If the controls are not numbers or their shape is another.
     """
     if not hasattr(problem, "goal_radius"):
-        raise ValueError(f"problem is {short_repr(problem)}; give a Problem, as make_problem() returns")
+        given = repr(problem).split("\n")[0][:100]
+        raise ValueError(f"problem is {given}; give a Problem, as make_problem() returns")
     array = _checked_controls(problem, controls)
     if not np.isfinite(array).all():
         return _left_out(problem, _non_finite(array, problem.dt))

@@ -23,7 +23,7 @@ from d4orm_planners.base.planner_registry import make_policy
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_d.planner import D4ormD, D4ormDConfig
-from d4orm_planners.hybrid.planner import Hybrid, HybridConfig, covered_by_discs
+from d4orm_planners.hybrid.planner import Hybrid, HybridConfig
 from d4orm_planners.mapf.planner import RoadmapSolution
 from d4orm_planners.tracking.tracker import follow_reference
 
@@ -278,14 +278,29 @@ def _discs_first(
 ) -> tuple[Candidate, CoarsePlan]:
     """A plan for the discs round the robots, who then move all at once; where there is none, for them themselves.
 
-    Footprints are planned one after another (:mod:`d4orm_planners.manoeuvres`), and the last ones come late.
+    Footprints and goal headings are planned one after another (:mod:`d4orm_planners.manoeuvres`), and the last ones
+    come late.
     """
-    team = coarse.team
-    if team.shapes and team.dimension == 2 and covered_by_discs(coarse):
-        chosen, plan = search(coarse.with_state(coarse.start, coarse.goal, team=team.replace(radius=team.radius)))
+    if (discs := as_discs(coarse)) is not None:
+        chosen, plan = search(discs)
         if not chosen.failed.any():
             return chosen, plan
     return search(coarse)
+
+
+def as_discs(problem: Problem) -> Problem | None:
+    """The problem for the discs round footprints, without the headings of robots that can turn when they are there.
+
+    ``None`` where that is the same problem, or leaves out more.
+    """
+    team, headed = problem.team, ~np.isnan(problem.goal_heading)
+    turn_later = not (headed & (team.turning_radius > 0)).any()
+    if team.dimension != 2 or not (team.shapes or headed.any()) or not turn_later:
+        return None
+    if any(model.trailers for model in team.robot_models):
+        return None
+    anywhere = np.full_like(problem.goal_heading, np.nan)
+    return problem.with_state(problem.start, problem.goal, team=team.replace(radius=team.radius), goal_heading=anywhere)
 
 
 def _coarse_planner(config: D4ormC2FConfig, reroute: bool) -> Planner:

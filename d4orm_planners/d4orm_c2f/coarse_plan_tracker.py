@@ -22,6 +22,7 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     CoarseWaypoints,
     StagnationMonitor,
     after_waiting,
+    as_discs,
     coarse_problem,
     interpolate,
     keep_time,
@@ -31,6 +32,7 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     visible_subgoals,
 )
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
+from d4orm_planners.manoeuvres.robots import can_plan
 from d4orm_planners.mapf.planner import relay_paths
 from d4orm_planners.tracking.steering import straight_drives
 
@@ -187,12 +189,14 @@ class CoarsePlanTracker:
     def _beginning(self, joint: JointState, keep: BoolArray) -> FloatArray | None:
         """``(H_c, K, m)`` straight drives, and for robots that ``keep`` ``(K,)`` drives along their paths.
 
-        ``None`` among walls, where the paths of the whole team are found anew on the roadmap.
+        ``None`` among walls, where the paths of the whole team are found anew on the roadmap, and for manoeuvres.
         """
         if self.guidance.ordered or not isinstance(self.guidance, CoarsePlan):
             return None
         factor = self._config.coarse_factor
         present = coarse_problem(self.problem.with_state(joint.states, joint.goals), factor)
+        if can_plan(present) and as_discs(present) is None:
+            return None
         initial = straight_drives(present).controls[:, :, 0]
         if keep.any():
             paths = self.guidance.path[::factor]

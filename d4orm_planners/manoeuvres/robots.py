@@ -15,6 +15,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.holonomic2d_jerk import HOLONOMIC2D_JERK
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE, Model
 from d4orm_env.dynamics.unicycle2 import MAX_TURN_ACCELERATION, UNICYCLE2
+from d4orm_planners.manoeuvres.coming_to_rest import can_brake, first_inert, motion
 from d4orm_planners.manoeuvres.costs import Area, Costs, costs_of
 from d4orm_planners.manoeuvres.curves import NO_CURVES, curves_of
 from d4orm_planners.manoeuvres.kinds import Kind
@@ -82,20 +83,17 @@ def scene_of(problem: Problem) -> ManoeuvreScene:
 
 
 def can_plan(problem: Problem) -> bool:
-    """Check whether all robots have primitives and start at rest, and any has a footprint or a goal heading."""
+    """Check whether all robots have primitives and start at rest, and any has a footprint or a goal heading.
+
+    Robots on their way come to rest first, if one of them turns only as it drives: others need not to turn at goals.
+    """
     team = problem.team
     if problem.dimension != 2 or not set(team.models) <= set(MOVES):
         return False
     if not team.shapes and np.isnan(problem.goal_heading).all():
         return False
-    # Trailers need not be in line.
-    begin = [model.state_size if model.trailers else _extra(model) for model in team.robot_models]
-    return not any(state[first:].any() for state, first in zip(problem.start, begin, strict=True))
-
-
-def _extra(model: Model) -> int:
-    """Number of the first state component beyond position and heading."""
-    return model.dimension if model.heading_index is None else model.heading_index + 1
+    moving = motion(problem, problem.start).any(axis=1)
+    return not moving.any() or (bool((moving & (team.turning_radius > 0)).any()) and can_brake(problem))
 
 
 def area_of(problem: Problem) -> Area:
@@ -161,13 +159,13 @@ def make_robot(scene: ManoeuvreScene, number: int, goal: Goal | None = None) -> 
     model = problem.team.robot_models[number]
     state = problem.start[number, : model.state_size].astype(np.float64).tolist()
     limits = problem.team.limits[number, : len(model.limit_names)].astype(np.float64).tolist()
-    begin = tuple(state[_extra(model) :])
+    begin = tuple(state[first_inert(model) :])
     kind = Kind(model.name, tuple(limits), problem.dt, area.cell, begin, scene.finest)
     primitives, _, modes = primitives_of(kind)
     if kind.start not in modes:
         return None
     start, goal, last = np.zeros(POSE_SIZE), goal or make_goal(problem, number), _limits(kind)
-    start[: _extra(model)] = state[: _extra(model)]
+    start[: first_inert(model)] = state[: first_inert(model)]
     start[3 : 3 + len(model.trailers)] = state[3 : 3 + len(model.trailers)]
     lattice = area.lattice(kind, float(start[2]), start, goal, len(modes))
     wanted = tuple(np.nan_to_num(goal.hitches[: len(model.trailers)]).tolist())

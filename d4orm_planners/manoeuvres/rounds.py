@@ -13,6 +13,7 @@ from d4orm_env.footprints import Box
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.manoeuvres.closing import GapSpace, ends_of, gap_closer
+from d4orm_planners.manoeuvres.coming_to_rest import come_to_rest
 from d4orm_planners.manoeuvres.curves import NO_CURVES
 from d4orm_planners.manoeuvres.nodes import AHEAD
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
@@ -54,7 +55,8 @@ def find_manoeuvres(search: SolveRun) -> TeamMotions | None:
     """Motions of the whole team, or of some robots if time is up; ``None`` if not all have one in the end."""
     with search.watch.paused():
         compile_manoeuvres(search.problem.team.models)
-    motions = TeamMotions.prepared(search.problem, search.should_stop)
+    at_rest = come_to_rest(search.problem, search.engine)
+    motions = None if at_rest is None else TeamMotions.prepared(at_rest[1], search.should_stop, before=at_rest[0])
     if motions is None:
         return None
     motions.plan_all()

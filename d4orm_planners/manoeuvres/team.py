@@ -42,6 +42,7 @@ class TeamMotions:
         scene: What all robots share.
         robots: What the search knows of each.
         should_stop: Whether time is up.
+        before: ``(T, K, m)`` controls that bring the team to where the motions begin, none by default.
 
     Attributes:
         robots: What the search knows of each.
@@ -53,8 +54,14 @@ class TeamMotions:
 
     groups = 1
 
-    def __init__(self, scene: ManoeuvreScene, robots: list[Robot], should_stop: Callable[[], bool]) -> None:
-        self.problem, self.robots, self.should_stop = scene.problem, robots, should_stop
+    def __init__(
+        self,
+        scene: ManoeuvreScene,
+        robots: list[Robot],
+        should_stop: Callable[[], bool],
+        before: FloatArray | None = None,
+    ) -> None:
+        self.problem, self.robots, self.should_stop, self._before = scene.problem, robots, should_stop, before
         self._area, self._interaction_range, problem = scene.area, scene.interaction_range, scene.problem
         size, horizon = problem.num_robots, problem.horizon
         self._poses = np.empty((size, horizon + 1, POSE_SIZE), np.float32)
@@ -86,7 +93,9 @@ class TeamMotions:
         self._nodes, self._searches = self._room_for_nodes(), size
 
     @classmethod
-    def prepared(cls, problem: Problem, should_stop: Callable[[], bool]) -> TeamMotions | None:
+    def prepared(
+        cls, problem: Problem, should_stop: Callable[[], bool], before: FloatArray | None = None
+    ) -> TeamMotions | None:
         """A team without motions; ``None`` if time is up, or a robot has none even alone."""
         scene = scene_of(problem)
         robots: dict[int, Robot] = {}
@@ -100,7 +109,7 @@ class TeamMotions:
         Threads(available_cores()).over(problem.num_robots, prepare)
         if len(robots) < problem.num_robots:
             return None
-        team = cls(scene, [robots[number] for number in range(problem.num_robots)], should_stop)
+        team = cls(scene, [robots[number] for number in range(problem.num_robots)], should_stop, before)
         return None if any(motion is None for motion in team.alone) else team
 
     @property
@@ -268,4 +277,4 @@ class TeamMotions:
         for robot, motion in enumerate(self.motions):
             if motion is not None:
                 controls[: motion.steps, robot, : motion.controls.shape[1]] = motion.controls
-        return controls
+        return controls if self._before is None else np.concatenate([self._before, controls])

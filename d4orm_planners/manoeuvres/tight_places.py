@@ -63,7 +63,7 @@ def motion_by_the_open(
             return None
         for out, into in product(*_ways_out_and_in(scene, careful, nodes, find)):
             motion = _joined(scene, robot, out, into, nobody, nodes, find)
-            if motion is not None:
+            if motion is not None and motion.steps <= scene.problem.horizon:
                 return motion
     return None
 

@@ -93,7 +93,7 @@ def test_the_function_draws_with_the_seed_of_the_episode() -> None:
 @pytest.mark.parametrize(
     ("goal", "message"),
     [
-        ([1.0], r"the next goal of robot_0 has shape \(1,\); expected \(2\)"),
+        ([1.0], r"the next goal of robot_0 has shape \(1,\); expected \(2,\)"),
         (None, "the next goal of robot_0"),
         ([np.nan, 0], r"the next goal of robot_0\[0\] is nan; every value must be finite"),
         ([5, 0], r"the next goal of robot_0 is \[5.0, 0.0\]; it must lie between \[-1.0, -1.0\] and \[2.0, 4.0\]"),

@@ -14,6 +14,7 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import COMMON
 from d4orm_env.envs.joint_state import JointState
+from d4orm_env.footprints import Box
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.candidate import failed_robots
 from d4orm_planners.base.policy_threads import Background
@@ -27,6 +28,7 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     CoarseWaypoints,
     StagnationMonitor,
     after_waiting,
+    as_discs,
     coarse_problem,
     interpolate,
     keep_time,
@@ -296,3 +298,19 @@ def test_robots_are_driven_at_a_velocity_and_brought_to_rest_in_as_few_steps_as_
     if not problem.team.robot_models[0].first_order:
         braking = int(np.ceil(half / (problem.team.max_acceleration[0] * problem.dt)))
         np.testing.assert_allclose(driven[braking:] - driven[braking], 0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("model", "headed"), [("unicycle", True), ("unicycle", False), ("car_first_order", False)])
+def test_discs_stand_for_footprints_and_for_those_that_can_turn_later(model: str, headed: bool) -> None:
+    heading = 1.0 if headed else np.nan
+    problem = make_problem("circle", num_robots=3, model=model, footprint=Box(0.4, 0.2), goal_heading=heading)
+    discs = as_discs(problem)
+    assert discs is not None
+    assert not discs.team.shapes
+    assert np.isnan(discs.goal_heading).all()
+    np.testing.assert_array_equal(discs.team.radius, problem.team.radius)
+
+
+@pytest.mark.parametrize("arguments", [{"model": "unicycle"}, {"model": "car_first_order", "goal_heading": 1.0}])
+def test_discs_stand_for_no_others(arguments: dict[str, Any]) -> None:
+    assert as_discs(make_problem("circle", num_robots=3, **arguments)) is None

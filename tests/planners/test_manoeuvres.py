@@ -18,6 +18,8 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_env.footprints import Box, Train
 from d4orm_planners import make_planner
 from d4orm_planners.base.plan import Plan
+from d4orm_planners.engine.sampling_types import get_sampling_engine
+from d4orm_planners.manoeuvres.coming_to_rest import can_brake, come_to_rest
 from d4orm_planners.manoeuvres.curves import NO_CURVES, curves_of
 from d4orm_planners.manoeuvres.kinds import MAX_STEPS, Kind
 from d4orm_planners.manoeuvres.lattice import buffer_size
@@ -316,8 +318,39 @@ def test_a_car_gets_into_and_out_of_a_gap_where_only_short_moves_have_room(model
     solved(Problem(team, state, [goal[:2]], world, goal_heading=0.0, margin=0.02, horizon=600, arrival="stay"))
 
 
+def test_a_way_into_a_gap_that_takes_too_long_is_none() -> None:
+    world = World(boxes=[[1, -0.45, 2.08, 0], [2.92, -0.45, 4, 0]], lower=(1, -0.45), upper=(4, 1))
+    team, start = Team(("car_first_order",), footprint=Box(0.6, 0.3)), [[1.4, 0.55, 0.0]]
+    problem = Problem(team, start, [[2.5, -0.225]], world, goal_heading=0.0, margin=0.02, horizon=20)
+    assert TeamMotions.prepared(problem, lambda: False) is None
+    assert TeamMotions.prepared(problem.replace(horizon=60), lambda: False) is not None
+
+
 def test_discs_without_headings_are_planned_otherwise() -> None:
     """Others have the same plans as ever, and nothing new to compile."""
     team = Team(("unicycle", "unicycle"))
     assert not can_plan(Problem(team, [[0, 0, 0], [0, 2, 0]], [[2, 0], [2, 2]]))
     assert can_plan(Problem(team, [[0, 0, 0], [0, 2, 0]], [[2, 0], [2, 2]], goal_heading=[np.nan, 1.0]))
+
+
+def test_cars_on_their_way_come_to_rest_before_they_manoeuvre() -> None:
+    """Their primitives begin at rest; a drive among them turns in place and stops too."""
+    team = Team(("car", "car", "unicycle"))
+    start = [[0, 0, 3, 0.9, 0.4], [0, 2, 2, 0.5, -0.3], [2, 1, 2.5, 0, 0]]
+    problem = Problem(team, start, [[1.5, 0], [1.5, 2], [-1, 1]], goal_heading=[1.0, -2.0, np.nan], horizon=200)
+    plan = solved(problem)
+    assert plan.metrics["travel_time"] < 8  # samples, which begin as it moves, take twice as long
+    # Nobody can brake in time: others are left to solve it.
+    late = problem.with_state([[0, 0, 0, 0.9, 0], [0.45, 0, 3.1, 0.9, 0], [2, 1, 2.5, 0, 0]], problem.goal)
+    assert come_to_rest(late, get_sampling_engine("cpu")) is None
+
+
+def test_teams_that_can_stay_as_they_move_do() -> None:
+    start, goal = [[0, 0, 0.5, 0.4, 0], [0, 2, 0, 0, 0]], [[2, 0], [2, 2]]
+    assert not can_plan(Problem(Team(("unicycle2",) * 2), start, goal, goal_heading=1.0))
+    at_rest = Problem(Team(("unicycle2",) * 2), [[0, 0, 0.5, 0, 0], start[1]], goal, goal_heading=1.0)
+    assert can_plan(at_rest)
+    assert come_to_rest(at_rest, get_sampling_engine("cpu"))[1] is at_rest
+    # A speed that no control changes at once.
+    jerky = [[0, 0, 0.5, 0, 0, 0], [0, 2, 0, 0, 0, 0]]
+    assert not can_brake(Problem(Team(("holonomic2d_jerk",) * 2), jerky, goal))
