@@ -52,11 +52,11 @@ def compile_for_planning(planner: Planner, problem: Problem, announce: Callable[
         spread_waves()
         drive_once(models)
     elif planner.drives_straight:
-        samples, call = _samples_first(planner, problem), f"drive_once({models!r}, {planner.name!r})"
-        other = in_another_process(f"{call}; average_once({models!r})" if samples else call)
-        index_paths(models)
-        if samples:
+        other = in_another_process(f"drive_once({models!r}, {planner.name!r})")
+        if _samples_first(planner, problem):
             sample_once((models,))
+            average_once(models)
+        index_paths(models)  # the other has this left to do, too
     else:
         other = in_another_process(f"average_once({models!r}); roll_out_once({models!r})")
         sample_once((models,))
