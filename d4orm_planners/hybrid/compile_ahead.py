@@ -47,7 +47,7 @@ def compile_for_planning(planner: Planner, problem: Problem, announce: Callable[
     announce()
     # Either takes about half of the time. Should the other fail, its kernels are compiled when they are needed.
     if isinstance(planner, Hybrid) and _has_walls(problem):
-        other = in_another_process("find_paths()")
+        other = in_another_process(f"find_paths(); index_paths({models!r})")
         roll_out_once(models)
         spread_waves()
         drive_once(models)
